@@ -25,6 +25,7 @@ from evermap.slam.kernels import (
     FLOOR_VARIANCE,
     NOISE_NAMES,
     detection_residual,
+    find_from,
     invert_3x3,
     multiply,
     odometry_residual,
@@ -352,3 +353,12 @@ def test_products_in_place_are_numpys(rows, columns):
     root, j, squared = rng.normal(size=(columns, columns)), rng.normal(size=(rows, columns)), np.full((rows, rows), 7.0)
     sandwich(j, root @ root.T, np.full((rows, columns), 7.0), squared)
     assert squared == pytest.approx(j @ root @ root.T @ j.T)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 300])
+def test_a_row_is_found_from_wherever_the_search_begins(count: int) -> None:
+    random = np.random.default_rng(count)
+    for stamp_s in (np.linspace(0.0, 1.0, count), np.sort(random.normal(size=count).round(1))):
+        for at_s in (*random.normal(size=20), *random.choice(stamp_s, 5), -np.inf, np.inf):
+            for near in (*random.uniform(-5.0, count + 5.0, 3), np.nan, 1e300):
+                assert find_from(stamp_s, at_s, near) == np.searchsorted(stamp_s, at_s)

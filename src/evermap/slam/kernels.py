@@ -53,6 +53,21 @@ def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 @kernel
+def find_from(stamp_s: FloatArray, at_s: float, near: float) -> int:
+    """Return `np.searchsorted(stamp_s, at_s)`, sooner where it is near a row: odometry comes at an even pace."""
+    count = len(stamp_s)
+    row = int(near) if 0.0 <= near < count else 0
+    for _ in range(8):
+        if row > 0 and stamp_s[row - 1] >= at_s:
+            row -= 1
+        elif row < count and stamp_s[row] < at_s:
+            row += 1
+        else:
+            return row
+    return int(np.searchsorted(stamp_s, at_s))
+
+
+@kernel
 def reckoned_motions(
     first_s: FloatArray,
     second_s: FloatArray,
@@ -67,10 +82,11 @@ def reckoned_motions(
     """
     pose = np.empty((2, 3))
     last = len(stamp_s) - 1
+    per_s = last / max(stamp_s[last] - stamp_s[0], 1e-300)
     for p in range(len(first_s)):
         for end in range(2):
             at_s = (first_s[p] if end == 0 else second_s[p]) + delay_s
-            after = min(max(np.searchsorted(stamp_s, at_s), 1), last)
+            after = min(max(find_from(stamp_s, at_s, (at_s - stamp_s[0]) * per_s), 1), last)
             lasted_s = max(stamp_s[after] - stamp_s[after - 1], 1e-300)  # stamps may be equal
             share = min(max((at_s - stamp_s[after - 1]) / lasted_s, 0.0), 1.0)
             for k in range(3):
