@@ -1,0 +1,67 @@
+"""What a cause changes, linearised alone, against all of a session linearised again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap.config import Config
+from evermap.estimate.sparse.system import exhausted
+from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.evidence import Screen, optimum_of, residuals_of
+from evermap.explain.linearise import STEP, change_by
+from evermap.maps.sessions import session
+from evermap.slam.estimate import Solved
+from evermap.slam.intake import prepare
+from evermap.slam.smoother import Smoother
+
+from .worlds import World
+
+CONFIG = Config.model_validate({"slam": {"explain": {"on": False}}})
+
+
+def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised() -> None:
+    visit, _, inputs = session.explained(Inputs.of(World(seed=2).plane(), None), CONFIG, ())
+    solved: Any = session.solution_of(visit)
+    assert isinstance(solved, Solved)
+    screen, asked = Screen.of(optimum_of(solved)), set()
+    graph, state, problem = screen.optimum.graph, screen.optimum.state, solved.outcome.problem
+    for suspect in list_suspects(inputs, calibrations=True):
+        found, step = change_by(solved, screen, inputs, suspect), STEP * suspect.sigma
+        if found is None:  # a clock that leaves frames behind the odometry
+            continue
+        other = prepare(suspect.undo(inputs, step).recording, None, (), solved.settings.odometry).problem  # type: ignore[arg-type]
+        names = ("stamp_s", "drive", "reading", "sigma_given", "mount")
+        moved = replace(problem, **{name: getattr(other, name) for name in names})
+        smoother = Smoother(moved, solved.outcome.noise.noise, robust=solved.settings.robust)
+        now = exhausted(replace(graph, blocks=smoother.blocks(state.known)).linearised(state))
+        expected = (residuals_of(graph, now)[0] - screen.residual) / step
+        assert np.abs(expected).max() > 0.0, suspect.subject
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), suspect.subject
+        asked.add(suspect.code)
+    assert {"range-scale", "odometry-scale", "turn-scale", "mount"} <= asked
+
+
+def test_a_lens_changes_residuals_as_if_all_were_read_again() -> None:
+    visit, _, inputs = session.explained(Inputs.of(World(seed=2).space(corners=True), None), CONFIG, ())
+    solved = session.solution_of(visit)
+    screen, asked = Screen.of(optimum_of(solved)), 0
+    for suspect in list_suspects(inputs, calibrations=True):
+        if suspect.code not in {"focal-length", "intrinsics", "distortion"}:
+            continue
+
+        def read_again(inputs: Inputs, state: float, undo: Any = suspect.undo) -> Inputs:
+            undone = undo(inputs, state)
+            return replace(undone, recording=replace(undone.recording, detections=replace(undone.recording.detections)))
+
+        found = change_by(solved, screen, inputs, suspect)
+        expected = change_by(solved, screen, inputs, replace(suspect, undo=read_again))
+        assert found is not None
+        assert expected is not None
+        assert np.abs(expected).max() > 0.0
+        assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max(), suspect.subject
+        asked += 1
+    assert asked > 0
