@@ -66,7 +66,7 @@ def decided(
         stays=session.stays(),
         sightlines=entered.sightlines.after_session(hidden, shown),
     )
-    return after, with_swaps(session.found, before, after, settings)
+    return after, with_swaps(session.found, after, settings)
 
 
 def with_replaced(
