@@ -379,6 +379,16 @@ def test_it_moved_by_the_sum_of_its_moves_whatever_became_of_the_frame() -> None
     assert (change.kind, change.landmark_ids) == (SWAPPED, (1, 2))
 
 
+def test_of_two_sessions_that_begin_at_once_each_tells_its_own(tmp_path: Path) -> None:
+    at_once = Provenance(recording="patrol", stamp_from_s=5.0, stamp_to_s=9.0)
+    with open_store(tmp_path / "map.evermap", create=True) as store:
+        store.commit(a_map({5: HERE}), at_once, parent=0)
+        moved = told(MOVED, 5, by=(3.0, 0.0))
+        store.commit(a_map({5: THERE}), at_once, [moved], parent=1)
+        assert diff(store, 1, 2).changes == (moved,)
+        assert [change.kind for change in diff(store, 2, 1).changes] == [MOVED]
+
+
 def test_what_came_into_the_map_on_the_way_grew_it_whatever_the_earlier_map_knew() -> None:
     sessions = [([], False), ([told(MOVED, 5, by=(3.0, 0.0))], False)]
     assert net(sessions, a_map({5: HERE}), a_map({5: THERE}), new=frozenset({5})) == ()

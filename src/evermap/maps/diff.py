@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import takewhile
 from typing import Any
@@ -171,21 +171,21 @@ def told_between(store: MapStore, a: int, b: int) -> tuple[list[ToldBySession], 
     old, new = story_of(store, a), story_of(store, b)
     had, has = ({one.revision for one in story} for story in (old, new))
     if had <= has:
-        since = [one for one in new if one.start_s > _instant(old)]
+        since = _after(new, had)
         if all(one.new is None for one in new):  # no late session: the map of `a` is that of its instant
             return [(one.changes, False) for one in since], None
         found = [_new_in(store, one) if one.new is None else one.new for one in since]
         return [(one.changes, False) for one in since], frozenset[int]().union(*found)
     if has <= had:
-        return [(one.changes[::-1], True) for one in reversed(old) if one.start_s > _instant(new)], None
+        return [(one.changes[::-1], True) for one in reversed(_after(old, has))], None
     common = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(old, new, strict=False)))
     back = [(one.changes[::-1], True) for one in reversed(old[common:])]
     return [*back, *((one.changes, False) for one in new[common:])], None
 
 
-def _instant(story: Sequence[Chapter]) -> float:
-    """The instant that a revision stands for."""
-    return max((one.start_s for one in story), default=-math.inf)
+def _after(story: Sequence[Chapter], had: Collection[int]) -> Sequence[Chapter]:
+    """The sessions of a story after the instant of a revision that has some of them."""
+    return story[max((k for k, one in enumerate(story, start=1) if one.revision in had), default=0) :]
 
 
 def _new_in(store: MapStore, session: Chapter) -> frozenset[int]:
