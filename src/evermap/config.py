@@ -952,6 +952,9 @@ class DecisionConfig(Section):
     least_evidence: NotNegative = key(
         1.5, "log likelihood ratio of looks against a clique before it is reported as vanished"
     )
+    least_looks: NotNegative = key(
+        0.9, "detections that its misses stand for, each by how probably its line was clear, before it is reported so"
+    )
     credible: Share = key(
         0.6, "a missed clique is gone only if it also is under the upper bound of this lifetime interval"
     )

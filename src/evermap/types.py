@@ -910,7 +910,8 @@ class MapChange(Shown):
             or is not, there.
         rotation_rad: about the centroid, counter-clockwise, in space about any axis; 0 where it did not turn.
         probability: of this very group at this time, over all hypotheses that were weighed.
-        n_hits, n_misses: detections at the new place, and expected detections at the old one that did not come.
+        n_hits, n_misses: detections at the new place, and expected detections at the old one that did not come: in a
+            living map misses count by how probably their lines of sight were clear.
         names: what the landmarks are called, if any id has a text behind it; see `labels`.
     """
 

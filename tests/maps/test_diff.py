@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,12 @@ from typer.testing import CliRunner
 
 import evermap as em
 from evermap.cli.main import app
-from evermap.maps.diff import Difference, diff, edits, grown, net
+from evermap.maps.diff import Difference, diff, edits, grown, net, read_log, story_of
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
+from evermap.maps.store.content import DamagedError
+from evermap.maps.store.history import read_story
+from evermap.maps.why import why
 from evermap.types import ChangeKind, MapChange, rows_of
 
 APPEARED, VANISHED, RETURNED = ChangeKind.APPEARED, ChangeKind.VANISHED, ChangeKind.RETURNED
@@ -316,14 +320,80 @@ def test_an_edit_is_told_beside_the_changes(site: Path, tmp_path: Path) -> None:
         assert diff(store, head - 1).changes == tuple(c for c in diff(store, head - 1, head).changes)
 
 
-def test_a_session_that_arrives_late_tells_how_the_newest_map_changed(site: Path, tmp_path: Path) -> None:
-    """Between the newest map and the one with the late session in it: each thing at most once, and as both maps say."""
-    with open_store(tmp_path / "late.evermap", create=True) as store:
+def test_a_late_session_is_told_as_if_it_had_come_in_time(site: Path, tmp_path: Path) -> None:
+    """It, those after it, and whatever lies between two instants; the instant of the newest map stays as it was."""
+    with open_store(tmp_path / "late.evermap", create=True) as store, open_store(site) as in_time:
         fed = [fed_into(store, site.parent / f"day{day}") for day in (0, 1, 3, 2)]
-        found = diff(store, 3, 4)
         assert fed[-1].replayed
-        assert list(found.changes) == list(fed[-1].changes) == list(store.changes(4))
-        assert_ends_fit(found, store.load(3), store.load(4))
+        assert_told_alike(store.changes(4), in_time.changes(3))
+        assert_told_alike(fed[-1].changes, in_time.changes(3))
+        story = story_of(store)
+        assert [one.revision for one in story] == [1, 2, 4, 3]
+        for one, wanted in zip(story, story_of(in_time, 4), strict=True):
+            assert_told_alike(one.changes, wanted.changes)
+            assert one.n_grown == wanted.n_grown
+        assert diff(store, 3, 4).changes == ()
+        assert diff(store, 4, 3).changes == ()
+        for a in range(3):
+            assert_told_alike(diff(store, a, 4).changes, diff(in_time, a, 4).changes)
+            assert_told_alike(diff(store, 4, a).changes, diff(in_time, 4, a).changes)
+        log, wanted_log = read_log(store), in_time.log()
+        assert [log[k].n_changes for k in (0, 1, 3, 2)] == [item.n_changes for item in wanted_log[:4]]
+        assert log[2].n_changes != store.log()[2].n_changes  # as the third session told it without the late one
+        name = next(c for c in story[-1].changes if c.kind is MOVED).landmark_ids[0]
+        answer = why(store, name)
+        assert [number for number, _ in answer.changes] == [
+            one.revision for one in story for change in one.changes if name in change.landmark_ids
+        ]
+        line = next(item for item in store.attachments() if item.name == "story")
+        assert read_story(store.attached(line), 4) == (2, story[2:])
+        with pytest.raises(DamagedError, match="the story of revision 4 is not valid"):
+            read_story(b"{}", 4)
+
+
+def assert_told_alike(some: Sequence[MapChange], wanted: Sequence[MapChange]) -> None:
+    """To 1e-6, in any order."""
+    some, wanted = (sorted(told, key=lambda c: (c.kind.value, c.landmark_ids)) for told in (some, wanted))
+    assert [(c.kind, c.landmark_ids, c.n_hits, c.n_misses) for c in some] == [
+        (c.kind, c.landmark_ids, c.n_hits, c.n_misses) for c in wanted
+    ]
+    for one, other in zip(some, wanted, strict=True):
+        numbers = [
+            (c.stamp_from_s, c.stamp_to_s, *c.displacement_m, c.rotation_rad, c.probability) for c in (one, other)
+        ]
+        np.testing.assert_allclose(*numbers, atol=1e-6, rtol=0.0)
+
+
+def test_it_moved_by_the_sum_of_its_moves_whatever_became_of_the_frame() -> None:
+    """Two maps may have their origins where their first sessions began; what is told lies between places of one map."""
+    sessions = [([told(MOVED, 5, by=(1.0, 0.0))], False), ([told(MOVED, 5, by=(2.0, 0.0))], False)]
+    (change,) = net(sessions, a_map({5: (40.0, 7.0)}), a_map({5: THERE}))
+    np.testing.assert_allclose(change.displacement_m, (3.0, 0.0))
+    there_and_back = [([told(MOVED, 5, by=(1.0, 0.0))], False), ([told(MOVED, 5, by=(-1.0, 0.0))], False)]
+    assert net(there_and_back, a_map({5: (40.0, 7.0)}), a_map({5: HERE})) == ()
+    swapped = [
+        ([told(MOVED, 1, by=(3.0, 0.0))], False),
+        ([told(MOVED, 2, by=(-3.0, 0.0))], False),
+    ]
+    (change,) = net(swapped, a_map({1: FAR, 2: FAR}), a_map({1: THERE, 2: HERE}))
+    assert (change.kind, change.landmark_ids) == (SWAPPED, (1, 2))
+
+
+def test_of_two_sessions_that_begin_at_once_each_tells_its_own(tmp_path: Path) -> None:
+    at_once = Provenance(recording="patrol", stamp_from_s=5.0, stamp_to_s=9.0)
+    with open_store(tmp_path / "map.evermap", create=True) as store:
+        store.commit(a_map({5: HERE}), at_once, parent=0)
+        moved = told(MOVED, 5, by=(3.0, 0.0))
+        store.commit(a_map({5: THERE}), at_once, [moved], parent=1)
+        assert diff(store, 1, 2).changes == (moved,)
+        assert [change.kind for change in diff(store, 2, 1).changes] == [MOVED]
+
+
+def test_what_came_into_the_map_on_the_way_grew_it_whatever_the_earlier_map_knew() -> None:
+    sessions = [([], False), ([told(MOVED, 5, by=(3.0, 0.0))], False)]
+    assert net(sessions, a_map({5: HERE}), a_map({5: THERE}), new=frozenset({5})) == ()
+    (change,) = net(sessions, EMPTY, a_map({5: THERE}), new=frozenset())
+    assert change.kind is MOVED
 
 
 def fed_into(store: MapStore, recording: Path) -> em.Entered:

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,12 @@ import pytest
 import evermap as em
 from evermap.config import Config, parse_config, to_toml
 from evermap.errors import DataError, InputError
+from evermap.maps.diff import diff, story_of
 from evermap.maps.living import LivingMap
 from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, open_store
 from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.runs.sessions import UnbridgedError, at_time
-from evermap.types import Recording
+from evermap.types import MapChange, Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=35.0), 3).sessions
@@ -169,6 +171,43 @@ def test_a_late_session_says_what_it_changed_and_what_was_brought_in_again(tmp_p
         assert store.head() == 4
         told = [(change.kind, change.landmark_ids) for change in store.changes(4)]
         assert told == [(change.kind, change.landmark_ids) for change in entered.changes]
+
+
+ANYHOW = tuple(permutations(range(3)))
+
+
+@cache
+def told_in(order: tuple[int, ...]) -> dict[tuple[str, float], list[str]]:
+    """What each session of a map tells, and what changed since each of its revisions, by the instant of these; sessions
+    of two robots, which came in this order and one of them twice.
+    """
+    sessions = [replace(session, robot=f"robot {k % 2}") for k, session in enumerate(SESSIONS[:3])]
+    with tempfile.TemporaryDirectory() as folder, open_store(Path(folder) / "site.evermap", create=True) as store:
+        for k in order:
+            fed(store, sessions[k])
+        with pytest.raises(InputError, match="is in the map already"):
+            em.enter_session(store, sessions[order[0]])
+        by_session = {("told by", one.start_s): sorted(map(spoken, one.changes)) for one in story_of(store)}
+        return by_session | {
+            ("since", store.load(number).session_start_s): sorted(map(spoken, diff(store, number).changes))
+            for number in range(store.head() + 1)
+        }
+
+
+def spoken(change: MapChange) -> str:
+    """A change to 1e-6."""
+    numbers = (change.stamp_from_s, change.stamp_to_s, *change.displacement_m, change.rotation_rad, change.probability)
+    rounded = [float(np.round(number, 6)) + 0.0 for number in numbers]
+    return str((change.kind.value, change.landmark_ids, rounded, change.n_hits, change.n_misses))
+
+
+@pytest.mark.parametrize("order", ANYHOW[1:], ids=str)
+def test_the_story_does_not_depend_on_who_tells_it_first(order: tuple[int, ...]) -> None:
+    """Of all sessions, and between any two instants, changes and probabilities are the same to 1e-6."""
+    wanted, found = told_in(ANYHOW[0]), told_in(order)
+    assert found == {span: wanted[span] for span in found}
+    assert len([span for span in found if span[0] == "told by"]) == 3
+    assert sum(map(len, found.values())) > 5
 
 
 def test_an_operators_word_is_kept(tmp_path: Path) -> None:

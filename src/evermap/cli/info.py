@@ -190,12 +190,13 @@ def _topics(path: Path) -> dict[str, tuple[str, int]]:
 
 def _map(path: Path) -> Described:
     from evermap.cli.map import revision_row
+    from evermap.maps.diff import read_log
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import life_dicts, revision_dict
     from evermap.types import json_number, stamp_text
 
     with open_store(path) as store:
-        revisions, living = store.log(), store.load()
+        revisions, living = read_log(store), store.load()
     landmarks = living.landmarks(p_least=0.5)
     lives = life_dicts(living)
     sessions = sum(item.provenance.kind.value == "session" for item in revisions)

@@ -52,11 +52,12 @@ def log(file: MapFile, as_json: AsJson = False) -> None:
     Example:
       evermap map log site.evermap
     """
+    from evermap.maps.diff import read_log
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import revision_dict
 
     with open_store(file) as store:
-        revisions = store.log()
+        revisions = read_log(store)
         clock = store.load().clock
     if as_json:
         newest = revisions[-1].number if revisions else 0

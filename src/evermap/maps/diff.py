@@ -1,9 +1,12 @@
 """Differences between revisions of a map: the changes reported by its sessions, composed to their net effect.
 
-Only sessions report changes (`sessions.decide`), and every revision stores its own. Between neighbouring revisions the
-difference is the session's report. Over several of them the changes of each landmark are composed: what left and came
-back to its place is no difference, what moved twice moved once. Where the way from one revision to the other leads back
-in history, through a revert or because that was asked for, changes are undone.
+Only sessions report changes (`sessions.decide`). A revision stands for an instant of the world: the beginning of the
+newest session in it. What changed between two is what the sessions between these instants tell, by the revision that
+knows more (`story_of`): with a late session in the map the later ones tell what they would have told had it come in
+time, so the story does not depend on the order of uploads. From one session to the next the difference is the session's
+report. Over several of them the changes of each landmark are composed: what left and came back to its place is no
+difference, what moved twice moved once. Where the way leads back, through a revert or because that was asked for,
+changes are undone.
 
 A landmark that the earlier map did not know, and that nobody saw appear, has not changed: the map grew by it.
 """
@@ -12,8 +15,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -22,14 +26,18 @@ from evermap.config import DecisionConfig
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import TURNS, LivingMap, Members
-from evermap.maps.store.protocol import MapStore
+from evermap.maps.store.content import DamagedError
+from evermap.maps.store.history import STORY, Chapter, read_story
+from evermap.maps.store.protocol import DamagedMapError, MapStore, Revision, RevisionKind
 from evermap.show import Shown, data_frame
-from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
+from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, MapChange
 
 USUAL = DecisionConfig()
 ToldBySession = tuple[Sequence[MapChange], bool]
 """Changes reported by a session, and whether they are inverted."""
 COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
+MUTUAL = frozenset({ChangeKind.SWAPPED, ChangeKind.REPLACED})
+"""Of two bodies, with the displacement of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,34 +110,113 @@ def diff(store: MapStore, a: int, b: int | None = None) -> Difference:
     b = store.head() if b is None else b
     before, after = store.load(a), store.load(b)
     names = after.landmark_names | before.landmark_names
-    changes = tuple(change.named(names) for change in net(told_between(store, a, b), before, after))
-    new = grown(before.members.landmark_id, after, changes)
-    return Difference(a, b, changes, new, edits(before.members, after.members))
+    told, new = told_between(store, a, b)
+    changes = tuple(change.named(names) for change in net(told, before, after, new=new))
+    more = grown(before.members.landmark_id, after, changes)
+    return Difference(a, b, changes, more, edits(before.members, after.members))
 
 
-def told_between(store: MapStore, a: int, b: int) -> list[ToldBySession]:
-    """Return the changes reported between two revisions, inverted from `a` back to the common ancestor."""
-    old, new = store.lineage(a), store.lineage(b)
-    common = sum(1 for one, other in zip(old, new, strict=False) if one == other)
-    back = [(store.changes(number)[::-1], True) for number in reversed(old[common:])]
-    return [*back, *((store.changes(number), False) for number in new[common:])]
+def story_of(store: MapStore, revision: int | None = None) -> tuple[Chapter, ...]:
+    """Return what each session of a revision tells, in the order of the world, with all of them in the map.
+
+    Raises:
+        DamagedMapError: a part is not what was written.
+    """
+    line = store.lineage(revision)
+    late = {item.revision: item for item in store.attachments(line) if item.name == STORY}
+    log = {item.number: item for item in store.log()}
+    told: dict[int, list[MapChange]] = {}
+    for number, change in store.changes_of():
+        told.setdefault(number, []).append(change)
+    chapters: list[Chapter] = []
+    for number in line:
+        if number in late:
+            try:
+                base, again = read_story(store.attached(late[number]), number)
+            except DamagedError as error:
+                raise DamagedMapError(str(error), path=store.where) from None
+            kept = set(store.lineage(base))
+            chapters = [*(one for one in chapters if one.revision in kept), *again]
+        elif (item := log[number]).provenance.kind is RevisionKind.SESSION:
+            changes = tuple(told.get(number, ()))
+            chapters.append(Chapter(number, item.provenance.stamp_from_s, changes, n_grown=item.n_grown))
+    return tuple(chapters)
+
+
+def read_log(store: MapStore) -> tuple[Revision, ...]:
+    """Return the revisions, with as many changes as their sessions tell by the newest one (`story_of`)."""
+    log = store.log()
+    if not any(item.name == STORY for item in store.attachments()):
+        return log
+    told = {one.revision: one for one in story_of(store)}
+    return tuple(
+        replace(
+            item,
+            n_changes=dict(Counter(change.kind for change in told[item.number].changes)),
+            n_grown=told[item.number].n_grown,
+        )
+        if item.number in told
+        else item
+        for item in log
+    )
+
+
+def told_between(store: MapStore, a: int, b: int) -> tuple[list[ToldBySession], frozenset[int] | None]:
+    """Return the changes between two revisions, and the landmarks that are new since the first, None where these are
+    all that it does not know.
+
+    Of two revisions of which one has all sessions of the other that one tells, between their instants. Where each has
+    its own, those of `a` are undone back to what they have in common.
+    """
+    old, new = story_of(store, a), story_of(store, b)
+    had, has = ({one.revision for one in story} for story in (old, new))
+    if had <= has:
+        since = _after(new, had)
+        if all(one.new is None for one in new):  # no late session: the map of `a` is that of its instant
+            return [(one.changes, False) for one in since], None
+        found = [_new_in(store, one) if one.new is None else one.new for one in since]
+        return [(one.changes, False) for one in since], frozenset[int]().union(*found)
+    if has <= had:
+        return [(one.changes[::-1], True) for one in reversed(_after(old, has))], None
+    common = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(old, new, strict=False)))
+    back = [(one.changes[::-1], True) for one in reversed(old[common:])]
+    return [*back, *((one.changes, False) for one in new[common:])], None
+
+
+def _after(story: Sequence[Chapter], had: Collection[int]) -> Sequence[Chapter]:
+    """The sessions of a story after the instant of a revision that has some of them."""
+    return story[max((k for k, one in enumerate(story, start=1) if one.revision in had), default=0) :]
+
+
+def _new_in(store: MapStore, session: Chapter) -> frozenset[int]:
+    """Landmarks that a session which was not late brought into the map."""
+    number = session.revision
+    after, before = store.members(number).landmark_id, store.members(number - 1).landmark_id
+    return frozenset(np.setdiff1d(after, before).tolist())
 
 
 def net(
-    sessions: Sequence[ToldBySession], a: LivingMap, b: LivingMap, settings: DecisionConfig = USUAL
+    sessions: Sequence[ToldBySession],
+    a: LivingMap,
+    b: LivingMap,
+    settings: DecisionConfig = USUAL,
+    *,
+    new: frozenset[int] | None = None,
 ) -> tuple[MapChange, ...]:
     """Return the net effect of successive reported changes.
 
     What one session told is returned as it is, and so is a change of landmarks of which no other is told. Of several
     the interval, the hits and the misses are those of all changes that the net effect rests on, and the probability is
     the product of theirs: of what vanished the last one, of what came the last coming and what followed, of what moved
-    all. It moved from its place in `a` to that in `b`.
+    all. It moved by the sum of its moves, each of which is between two places in one map: two maps may differ in their
+    frames.
 
     Args:
         sessions: the changes that each told, and whether they are undone.
         a: the map before them; its ids mean the same as those of `b`.
         b: the map after them.
         settings: what is the same place.
+        new: landmarks that came into the map on the way; None for all that `a` does not know.
     """
     if len(sessions) == 1 and not sessions[0][1]:
         return tuple(sessions[0][0])
@@ -149,7 +236,8 @@ def net(
     groups: dict[tuple[tuple[int, ...], bool, bool, bool], list[int]] = {}
     for name, numbers in sorted(steps.items(), key=lambda item: (item[1], item[0])):
         ends = (True, not (told[numbers[-1]].goes and name in stands)) if forth else (name in stood, name in stands)
-        groups.setdefault((tuple(numbers), name in known, *ends), []).append(name)
+        is_known = name in known if new is None else name not in new
+        groups.setdefault((tuple(numbers), is_known, *ends), []).append(name)
     found: list[MapChange] = []
     for (row, was_known, before, after), names in groups.items():
         path = [told[number] for number in row]
@@ -168,7 +256,7 @@ def net(
         both = parts[id(change)]
         if all(any(part is other for other in found) for part in both):  # nothing else is told of either
             found = [other for other in found if not any(other is part for part in both)] + [change]
-    return with_swaps(found, a, b, settings) if len({one.session for one in told}) > 1 else tuple(found)
+    return with_swaps(found, b, settings) if len({one.session for one in told}) > 1 else tuple(found)
 
 
 def _split_replacement(change: MapChange) -> tuple[MapChange, ...]:
@@ -225,21 +313,22 @@ def elsewhere(shift: FloatArray, turn: float, settings: DecisionConfig) -> bool:
     return bool(turned or math.hypot(*shift) >= settings.same_spot_m)
 
 
-def with_swaps(
-    found: Sequence[MapChange], before: LivingMap, after: LivingMap, settings: DecisionConfig = USUAL
-) -> tuple[MapChange, ...]:
-    """Return changes in which two moves to each other's place are one exchange, or of identities."""
+def with_swaps(found: Sequence[MapChange], after: LivingMap, settings: DecisionConfig = USUAL) -> tuple[MapChange, ...]:
+    """Return changes in which two moves to each other's place are one exchange, or of identities.
+
+    What moved was its displacement away from where it is in the map `after`.
+    """
     moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
     if len(moved) < 2:
         return tuple(found)
-    then, now = before.landmarks(), after.landmarks()
+    now = after.landmarks()
 
-    def at(records: Landmarks, names: tuple[int, ...]) -> FloatArray:
-        rows = np.isin(records.landmark_id, names)
-        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(_dim(before, after), np.nan)
+    def at(names: tuple[int, ...]) -> FloatArray:
+        rows = np.isin(now.landmark_id, names)
+        return np.asarray(now.position_m[rows].mean(axis=0)) if rows.any() else np.full(after.dim, np.nan)
 
-    was = {k: at(then, found[k].landmark_ids) for k in moved}
-    is_at = {k: at(now, found[k].landmark_ids) for k in moved}
+    is_at = {k: at(found[k].landmark_ids) for k in moved}
+    was = {k: is_at[k] - np.asarray(found[k].displacement_m) for k in moved}
     swapped: dict[int, int] = {}
     for a in moved:
         for b in moved:
@@ -305,7 +394,14 @@ def _composed(
 
 
 def _shift(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: LivingMap) -> tuple[FloatArray, float]:
-    """Return translation and rotation between the places in two maps; as reported where these are unknown."""
+    """Return translation and rotation over all steps as reported; where one of them is an exchange, or is undone,
+    between the places in the two maps.
+    """
+    steps = [one for one in path if not one.goes and one.change.kind is not ChangeKind.APPEARED]
+    if not any(one.undone or one.change.kind in MUTUAL for one in path):
+        shift = np.sum([one.change.displacement_m for one in steps], axis=0)
+        if np.shape(shift) and np.isfinite(shift).all() and _dim(a, b) < 3:  # turns in space do not add
+            return np.asarray(shift), sum(one.change.rotation_rad for one in steps)
     was, now = (_poses(living, np.array(names), _dim(a, b)) for living in (a, b))
     both = np.isfinite(was[:, 0]) & np.isfinite(now[:, 0])
     if both.any():

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.errors import InputError, similar
 from evermap.existence.sites import Evidence
-from evermap.maps.diff import edits
+from evermap.maps.diff import edits, story_of
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
 from evermap.show import Shown
@@ -55,7 +55,7 @@ class Answer(Shown):
         pinned, deleted: what an operator said.
         visits: by time.
         stays: of its clique, as the map has them now.
-        changes: that were told of it: revision and change.
+        changes: that its sessions tell of it, in the order of the world: revision and change.
         edits: of operators: revision, when, and what.
         evidence: every look at it.
         headline: the answer in a line.
@@ -112,9 +112,10 @@ def why(store: MapStore, landmark: int | str, revision: int | None = None) -> An
         evidence = evidence.joined(part)
     visits = tuple(_visit(log[number], part) for number, part in parts if len(part))
     changes = tuple(
-        (number, change.named(living.landmark_names))
-        for number, change in store.changes_of(landmark_id)
-        if number in line
+        (one.revision, change.named(living.landmark_names))
+        for one in story_of(store, revision)
+        for change in one.changes
+        if landmark_id in change.landmark_ids
     )
     class_id = int(living.members.class_id[row])
     answer = Answer(

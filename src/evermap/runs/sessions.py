@@ -18,7 +18,7 @@ import numpy as np
 from evermap import __version__
 from evermap.config import Config, parse_config, to_toml
 from evermap.errors import ConfigError, DataError, EvermapError, InputError, printable
-from evermap.maps.diff import edits, grown, net
+from evermap.maps.diff import edits, grown
 from evermap.maps.living import LivingMap
 from evermap.maps.store import (
     Attachment,
@@ -31,6 +31,7 @@ from evermap.maps.store import (
     open_store,
 )
 from evermap.maps.store.content import DamagedError
+from evermap.maps.store.history import STORY, Chapter, pack_story
 from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
@@ -73,7 +74,7 @@ class Entered(Shown):
         session: the session itself, in the map as it was at its time.
         newest: the newest revision of the map.
         living: the map after the session, and after all later sessions.
-        changes: from `newest` to `living`, as `maps.diff` tells them.
+        changes: that the session tells, at its time: the same whether it is late or not.
         replayed: names of the later sessions that were brought in again.
         parent: revision that it was made from.
         attachments: to commit with it.
@@ -293,23 +294,37 @@ def _enter_late(
     # ids that were given since are not given again
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
     living = _with_words(living, newest, recording.clock)
-    told = [(store.changes(step.revision.number)[::-1], True) for step in reversed(steps[first:])]
+    story: list[Chapter] = []
     for step in (step for step in later if step.start_s <= start_s):
-        living, changes = _again(store, step, living)
-        told.append((changes, False))
+        living = _retold(store, step, living, story)
     session = run_session(recording, living, config, progress=progress)
     if not session.found:
         return Entered(session, newest, newest, (), (), head, {})
+    story.append(_chapter(0, start_s, session.changes, living, session.living))
     living = session.living
-    told.append((session.changes, False))
     replayed = [step for step in later if step.start_s > start_s]
     for step in replayed:
-        living, changes = _again(store, step, living)
-        told.append((changes, False))
+        living = _retold(store, step, living, story)
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
-    decisions = (config or Config()).living.decisions
-    found = tuple(change.named(living.landmark_names) for change in net(told, newest, living, decisions))
-    return Entered(session, newest, living, found, names, head, {RECORDING: data})
+    attached = {RECORDING: data, STORY: pack_story(parent, story)}
+    return Entered(session, newest, living, session.changes, names, head, attached)
+
+
+def _retold(store: MapStore, step: _Step, living: LivingMap, story: list[Chapter]) -> LivingMap:
+    """The map after a session or an edit that it has had before; what a session tells is added to the story."""
+    if step.recording is None:
+        return _edited_again(store, step, living)
+    session = _session_again(store, step, living)
+    story.append(_chapter(step.revision.number, step.start_s, session.changes, living, session.living))
+    return session.living
+
+
+def _chapter(
+    revision: int, start_s: float, changes: tuple[MapChange, ...], before: LivingMap, after: LivingMap
+) -> Chapter:
+    known = before.members.landmark_id
+    new = frozenset(np.setdiff1d(after.members.landmark_id, known).tolist())
+    return Chapter(revision, start_s, changes, new, len(grown(known, after, changes)))
 
 
 def _first_again(steps: Sequence[_Step], start_s: float) -> int:
@@ -447,14 +462,6 @@ def _history(store: MapStore, head: int) -> list[_Step]:
         else:  # an operator's word holds from the newest session on that he knew
             steps.append(_Step(start_s, revision, None))
     return steps
-
-
-def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """The map after a session or an edit that it has had before, and what changed."""
-    if step.recording is None:
-        return _edited_again(store, step, living), ()
-    session = _session_again(store, step, living)
-    return session.living, session.changes
 
 
 def _edited_again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
@@ -642,7 +649,7 @@ def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequenc
             return 0
         kept: dict[str, dict[int, Attachment]] = {RECORDING: {}, TRAJECTORY: {}}
         for item in old.attachments():
-            kept[item.name][item.revision] = item
+            kept.setdefault(item.name, {})[item.revision] = item
         for count, step in enumerate(steps):
             number = start + count + 1
             wanted = replace(step.revision.provenance, wall_s=np.nan)

@@ -22,7 +22,6 @@ from evermap.types import (
     Frames,
     Innovations,
     Landmarks,
-    MapChange,
     Misses,
     Recording,
     SlamResult,
@@ -72,12 +71,11 @@ def write_view(path: str | Path, out: str | Path) -> tuple[str, ...]:
 
 def _of_map(path: Path) -> tuple[AnyRecording, SlamResult]:
     """The newest revision of a map, with the changes of all."""
+    from evermap.maps.diff import story_of
     from evermap.maps.store import open_store
 
     with open_store(path) as store:
-        living, told = store.load(), list[MapChange]()
-        for number in store.lineage():
-            told += store.changes(number)
+        living, told = store.load(), [change for one in story_of(store) for change in one.changes]
     poses = np.zeros((0, 7 if living.dim == 3 else 3))
     nowhere = Trajectory(np.zeros(0), poses, np.zeros((0, 6, 6)), frame="prior_map", clock=living.clock)
     changes = tuple(change.named(living.landmark_names) for change in told)

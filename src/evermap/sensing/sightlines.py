@@ -53,7 +53,12 @@ class Lines(NamedTuple):
     @property
     def p_detect(self) -> FloatArray:
         """(N,) mean detection probability."""
-        return self.p_free * self.hits / (self.hits + self.misses) + (1.0 - self.p_free) * self.p_blocked
+        return self.p_seen + (1.0 - self.p_free) * self.p_blocked
+
+    @property
+    def p_seen(self) -> FloatArray:
+        """(N,) probability of a detection along them that something stands for: they are clear, and it is detected."""
+        return self.p_free * self.hits / (self.hits + self.misses)
 
     def at(self, rate: float, highest: float) -> Lines:
         """Return lines along which a session detects `rate` times as often, with a probability of `highest` at most."""

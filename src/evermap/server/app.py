@@ -30,6 +30,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from evermap import __version__
 from evermap.errors import EvermapError, InputError, printable
 from evermap.maps.diff import diff as between
+from evermap.maps.diff import read_log, story_of
 from evermap.maps.living import LivingMap
 from evermap.maps.store import DamagedMapError, Provenance, Revision, StaleRevisionError, StoreUnavailableError
 from evermap.maps.store.postgres import PREFIX, SITE
@@ -441,7 +442,7 @@ def list_revisions(
     """List the first `most` revisions after `since`, the oldest first; with `config` also the settings of each."""
 
     def listed(store: SqlStore) -> list[dict[str, Any]]:
-        return [_revision(item, config=config) for item in store.log() if item.number > (since or 0)][:most]
+        return [_revision(item, config=config) for item in read_log(store) if item.number > (since or 0)][:most]
 
     return _told(request, site, listed)
 
@@ -463,8 +464,8 @@ def changes(request: Request, site: Site, _: Reader, since: AtRevision = 0) -> R
     """List the changes reported by revisions after `since`."""
 
     def listed(store: SqlStore) -> list[dict[str, Any]]:
-        line = {number for number in store.lineage() if number > (since or 0)}
-        return [{"revision": number, **change_dict(change)} for number, change in store.changes_of() if number in line]
+        told = [one for one in story_of(store) if one.revision > (since or 0)]
+        return [{"revision": one.revision, **change_dict(change)} for one in told for change in one.changes]
 
     return _told(request, site, listed)
 

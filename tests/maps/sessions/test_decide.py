@@ -48,9 +48,10 @@ def beliefs(living: LivingMap, log_evidence: FloatArray) -> Believed:
 
 @dataclass(slots=True)
 class Story:
-    """A map that goes through sessions whose beliefs are told."""
+    """A map that goes through sessions whose beliefs are told; lines to what is looked at are clear with `p_free`."""
 
     living: LivingMap = field(default_factory=LivingMap)
+    p_free: float = 1.0
 
     def body(self, landmark: int) -> int:
         members = self.living.members
@@ -176,7 +177,7 @@ class Story:
         key = np.zeros(len(place), dtype=np.int64)
         table = SiteLooks(stamp[order], clique[order], site[order], key, hit[order])
         counts = np.array([look.counts for look in looks], dtype=np.bool_)
-        lines = nominal_lines(np.ones(1))
+        lines = nominal_lines(np.ones(1))._replace(p_free=np.array([self.p_free]))
         sight = np.zeros(len(cliques), dtype=np.int64)
         return PlaceLooks(table, place[order], key, lines, (hit | counts)[order], hit[order], sight, np.zeros(2))
 
@@ -336,6 +337,20 @@ def test_misses_along_lines_that_are_not_known_to_be_clear_are_no_looks() -> Non
     looks = [*seen(1, 2, 9, since_s=1000.0), *(Look(8, 1010.0 + k, hit=False, counts=False) for k in range(9))]
     assert story.session(1000.0, rest, looks, away=(8,)) == ()
     assert story.stays_of(8).gone_s.tolist() == [np.inf]
+
+
+@pytest.mark.parametrize(
+    ("p_free", "misses", "looks"), [(0.4, 2, 0), (0.4, 3, 1), (0.8, 1, 0), (0.95, 1, 1), (0.3, 9, 3)]
+)
+def test_a_miss_counts_by_how_probably_its_line_was_clear(p_free: float, misses: int, looks: int) -> None:
+    """What is told has the number of looks that its misses are worth; for less than one nothing is told."""
+    story = told()
+    story.p_free = p_free
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    looked = [*seen(1, 2, 9, since_s=1000.0), *(Look(8, 1012.0 + k, hit=False) for k in range(misses))]
+    changes = story.session(1000.0, rest, looked, away=(8,))
+    assert [change.n_misses for change in changes] == [looks] * (looks > 0)
+    assert np.isinf(story.stays_of(8).gone_s[0]) == (looks == 0)
 
 
 @pytest.mark.parametrize(("log_evidence", "tells"), [(-1.4, False), (-1.6, True)])

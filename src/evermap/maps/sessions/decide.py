@@ -66,7 +66,7 @@ def decided(
         stays=session.stays(),
         sightlines=entered.sightlines.after_session(hidden, shown),
     )
-    return after, with_swaps(session.found, before, after, settings)
+    return after, with_swaps(session.found, after, settings)
 
 
 def with_replaced(
@@ -115,7 +115,8 @@ class _Session:
         cliques: (C,) ids; site: (C,) row of the most probable site of each; stands: (C,) whether it is there.
         p_away: (C,) probability that it stands nowhere; log_evidence: (C,) of the looks, for 'it stands somewhere'.
         least: (C,) evidence against it that it takes to tell that it vanished; missed: (C,) whether it was missed.
-        hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
+        hits: (S,) by site; expected: (S,) detections that its misses stand for, each by how probably its line was
+            clear; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
         last_s, gone_s, p_gone: (K,) of the stays; p_kept, since_s: (S,) of the sites.
         hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
@@ -142,7 +143,9 @@ class _Session:
         count = len(self.cliques)
         hit: BoolArray = looks.rows.hit
         self.hits = np.bincount(looks.rows.site[hit], minlength=len(sites))
-        self.misses = np.bincount(looks.rows.site[~hit & looks.counts], minlength=len(sites))
+        missed = ~hit & looks.counts
+        p_seen = looks.lines.p_seen[looks.rows.key[missed]]
+        self.expected = np.bincount(looks.rows.site[missed], p_seen, minlength=len(sites))
         self.was_hit = np.bincount(row, self.hits, minlength=count) > 0
         self.site, newest_s = np.zeros(count, dtype=np.int64), np.full(count, -np.inf)
         order = np.argsort(-sites.p_here, kind="stable")[::-1]
@@ -174,7 +177,7 @@ class _Session:
             self._moved(row, old, stay)
         elif (
             not self.stands[row]
-            and self.misses[old]
+            and self.expected[old] >= self.settings.least_looks
             and self.log_evidence[row] <= -self.least[row]
             and self.p_away[row] >= EXISTS
         ):
@@ -210,7 +213,7 @@ class _Session:
         since = self._begins(clique, site, elsewhere_s)
         if probability >= EXISTS:
             p, left = probability * float(sites.p_here[site]), _last_site(self.before, self.entered, clique)
-            n_misses = int(self.misses[left]) if left >= 0 else 0
+            n_misses = self._n_missed(left) if left >= 0 else 0
             self._tell(kind, left, site, elsewhere_s, since, p, int(self.hits[site]), n_misses)
 
     def stays(self) -> Stays:
@@ -246,14 +249,14 @@ class _Session:
         since = self._begins(int(self.cliques[row]), site, left_s)
         self.p_kept[site] = p_moved = float(self.sites.p_here[site])
         if elsewhere(*_motion(self.entered, old, site), self.settings):
-            n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
+            n_hits, n_misses = int(self.hits[site]), self._n_missed(old)
             self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
 
     def _vanished(self, row: int, old: int, stay: int) -> None:
         p_away = float(self.p_away[row])
         left_s = self._ends(old, stay, p_away)
         to_s = _first_miss(self.looks, old, left_s, self.start_s)
-        self._tell(ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(self.misses[old]))
+        self._tell(ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, self._n_missed(old))
 
     def _since_when(self, site: int, newest: int, same: bool, share: float) -> tuple[ChangeKind, float, float]:
         """Return whether a present clique returned or appeared, the last time of its absence, and the probability."""
@@ -294,7 +297,11 @@ class _Session:
         if probability >= EXISTS:
             self._tell(kind, -1, site, elsewhere_s, since, probability, int(self.hits[site]), 0)
         last_s = float(self.sites.seen_s[site])
-        self._tell(ChangeKind.VANISHED, site, -1, last_s, max(left_s, last_s), p_away, 0, int(self.misses[site]))
+        self._tell(ChangeKind.VANISHED, site, -1, last_s, max(left_s, last_s), p_away, 0, self._n_missed(site))
+
+    def _n_missed(self, site: int) -> int:
+        """The number of detections that the misses at a site stand for."""
+        return int(np.round(self.expected[site]))
 
     def _tell(
         self, kind: ChangeKind, left: int, site: int, from_s: float, to_s: float, p: float, n_hits: int, n_misses: int

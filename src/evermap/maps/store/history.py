@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -21,6 +21,8 @@ from evermap.types import ChangeKind, MapChange, or_nan
 
 FORMAT, IN_SPACE = 1, 2
 """Of records; those with changes in space an older evermap cannot read."""
+STORY = "story"
+"""Name of the attachment of a late session: what it and the later ones tell with it in the map."""
 _COUNT, _NUMBER = (int, type(None)), (float, int, type(None))
 _TYPES: Mapping[str, type | tuple[type, ...]] = {
     "number": int, "parent": int, "restores": _COUNT, "created_at": str, "evermap_version": str,
@@ -32,6 +34,48 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
 """Values of a record, and their types in JSON; null for nan."""
 _SHOWN = 5
 _MAY_BE_NAN = ("stamp_from_s", "stamp_to_s", "wall_s")
+
+
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """What a session tells in the order of the world.
+
+    Attributes:
+        revision: that its recording was committed with.
+        start_s: when it began.
+        changes: since the session before it.
+        new: landmarks that the map did not know before it; None if nobody counted them.
+        n_grown: those of them that stand, and that nobody saw appear; None as in `Revision`.
+    """
+
+    revision: int
+    start_s: float
+    changes: tuple[MapChange, ...]
+    new: frozenset[int] | None = None
+    n_grown: int | None = None
+
+
+def pack_story(base: int, chapters: Sequence[Chapter]) -> bytes:
+    """Return the bytes of the sessions after revision `base`; 0 is the revision of the one that they belong to."""
+    rows = [
+        [one.revision, one.start_s, [_change_to_list(change) for change in one.changes], sorted(one.new or ()),
+         one.n_grown]
+        for one in chapters
+    ]  # fmt: skip
+    return json.dumps({"base": base, "sessions": rows}).encode()
+
+
+def read_story(data: bytes, revision: int) -> tuple[int, tuple[Chapter, ...]]:
+    """Read what `pack_story` wrote for a revision; `DamagedError` if it is anything else."""
+    try:
+        row = json_object(data.decode())
+        chapters = tuple(
+            Chapter(number or revision, float(start_s), tuple(map(_change_from_list, told)), frozenset(new), n_grown)
+            for number, start_s, told, new, n_grown in row["sessions"]
+        )
+        return int(row["base"]), chapters
+    except (ValueError, TypeError, LookupError) as error:
+        raise DamagedError(f"the story of revision {revision} is not valid: {error}") from None
 
 
 @dataclass(frozen=True, slots=True)
