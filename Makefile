@@ -17,7 +17,8 @@ OUT ?= out/demo
 # compile our modules and rewrite the assertions of all tests again.
 PROCESSES ?= $(shell n=$$(($$(nproc 2>/dev/null || echo 2) + 1)); echo $$((n > 6 ? 6 : n)))
 PYTEST = PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(PROCESSES) --dist worksteal
-PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
+BYTECODE ?= --compile
+PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check $(BYTECODE)
 RUNTIME = $(VENV)/.stamp-runtime
 DEVELOPMENT = $(VENV)/.stamp-development
 DOCUMENTATION = $(VENV)/.stamp-documentation
