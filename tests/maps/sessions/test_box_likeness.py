@@ -1,0 +1,115 @@
+"""How boxes that are the same, and others in their place, are told apart: rules by hand, and what is learned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from evermap.config import BoxesConfig
+from evermap.maps.sessions import box_likeness
+from evermap.maps.sessions.box_likeness import BoxLikeness, BoxPairs
+from evermap.types import FloatArray
+
+SETTINGS = BoxesConfig()
+USUAL = BoxLikeness.usual(SETTINGS)
+SAME_M, OTHER_M = np.array(SETTINGS.sigma_size_m), np.array(SETTINGS.sigma_class_m)
+
+
+def paired(away_m: FloatArray, size_m: FloatArray, p: float = 0.9, turn_rad: float = 0.0) -> BoxPairs:
+    """Pairs (N, 1), side by side along x by `away_m` (N,), with differences of sizes (N, 3)."""
+    n = len(away_m)
+    off_m = np.column_stack([away_m, np.zeros(n)])[:, None]
+    spread_m2 = np.tile(0.04 * np.eye(2), (n, 1, 1, 1))
+    each, yes = np.ones((n, 1)), np.ones((n, 1), dtype=np.bool_)
+    return BoxPairs(away_m[:, None], off_m, spread_m2, size_m[:, None], turn_rad * each, yes, yes, p * each)
+
+
+def odds(pairs: BoxPairs, likeness: BoxLikeness = USUAL) -> float:
+    return float(likeness.log_odds(pairs)[0, 0])
+
+
+ONE = paired(np.array([0.1]), np.zeros((1, 3)))
+
+
+def test_sizes_are_compared_as_those_of_one_box_and_of_two() -> None:
+    """The ratio of two normal densities, axis by axis, but for a share that is seen with any size."""
+    size_m = np.array([[0.1, 0.05, -0.02]])
+    ratio = float(np.prod(stats.norm.pdf(size_m[0], 0.0, SAME_M) / stats.norm.pdf(size_m[0], 0.0, OTHER_M)))
+    expected = math.log((1.0 - SETTINGS.odd_share) * ratio + SETTINGS.odd_share)
+    assert USUAL.size_nats(paired(np.zeros(1), size_m))[0, 0] == pytest.approx(expected)
+    assert odds(paired(np.array([0.1]), 8.0 * SAME_M[None])) < odds(ONE) - 1.0
+    unknown = paired(np.zeros(1), np.full((1, 3), np.nan))
+    assert USUAL.size_nats(unknown)[0, 0] == pytest.approx(0.0)
+
+
+def test_no_other_box_is_there_unless_the_former_left() -> None:
+    """The more surely a box left, the more probably it is another; where there is room for both, that is no matter."""
+    stays, left = (odds(replace(ONE, p=np.full((1, 1), p))) for p in (0.95, 0.5))
+    assert stays - left == pytest.approx(math.log(0.95 / 0.05), abs=1e-9)
+    apart = replace(ONE, over=np.zeros((1, 1), dtype=np.bool_))
+    stays, left = (odds(replace(apart, p=np.full((1, 1), p))) for p in (0.95, 0.5))
+    assert stays - left == pytest.approx(math.log(0.95 / 0.5), abs=1e-9)
+
+
+def test_hazards_that_are_faster_end_more_stays() -> None:
+    """The belief to the power of the factor on hazards, in both explanations."""
+    hasty = replace(USUAL, haste=3.0)
+    same, other = hasty.log_likelihoods(ONE)
+    as_believed = USUAL.log_likelihoods(replace(ONE, p=np.full((1, 1), 0.9**3)))
+    np.testing.assert_allclose((same, other), as_believed)
+    assert odds(ONE, hasty) < odds(ONE)
+
+
+def test_a_place_that_is_often_taken_again_speaks_for_another_box() -> None:
+    assert odds(ONE, replace(USUAL, p_taken=0.9)) < odds(ONE, replace(USUAL, p_taken=0.1)) - 1.0
+    assert odds(paired(np.array([1.0]), np.zeros((1, 3)))) < odds(ONE) - 2.0
+    assert odds(replace(ONE, turn_rad=np.full((1, 1), 1.0))) < odds(ONE) - 0.5
+
+
+@pytest.mark.parametrize(("count", "squared", "usual"), [(4.0, 0.5, 0.1), (300.0, 3.0, 0.5), (2.0, 1e-3, 0.3)])
+def test_a_spread_is_the_most_probable_one(count: float, squared: float, usual: float) -> None:
+    """Normal numbers with a log-normal prior about the usual spread, against a minimiser."""
+
+    def cost(at: float) -> float:
+        prior = 0.5 * ((at - math.log(usual)) / box_likeness.NATS) ** 2
+        return count * at + 0.5 * squared * math.exp(-2.0 * at) + prior
+
+    best = optimize.minimize_scalar(cost, bounds=(-8.0, 3.0), method="bounded", options={"xatol": 1e-9}).x
+    assert box_likeness._spread(count, squared, usual) == pytest.approx(math.exp(best), rel=1e-5)
+
+
+def test_nothing_seen_leaves_the_usual_spread() -> None:
+    assert box_likeness._spread(0.0, 0.0, 0.2) == pytest.approx(0.2)
+
+
+def test_how_often_places_are_taken_again_is_learned() -> None:
+    """Of 60 boxes the half are others: hazards were faster, or places are taken more often, than was believed."""
+    p = np.full(60, 0.9)
+    fast = box_likeness._turnover(p, np.repeat([1.0, 0.0], 30), SETTINGS)
+    slow = box_likeness._turnover(p, np.ones(60), SETTINGS)
+    assert fast[0] > 3.0 > 1.5 > slow[0]
+    assert fast[1] > slow[1]
+
+
+def test_no_boxes_leave_hazards_and_places_as_usual() -> None:
+    haste, p_taken = box_likeness._turnover(np.zeros(0), np.zeros(0), SETTINGS)
+    assert haste == pytest.approx(1.0)
+    assert p_taken == pytest.approx(SETTINGS.p_taken, abs=0.02)
+
+
+def test_spreads_of_sizes_are_learned_from_both_kinds_of_pairs() -> None:
+    """A detector that repeats sizes three times as well as is usual; one in four is another box."""
+    rng = np.random.default_rng(0)
+    n_same, n_other = 90, 30
+    size_m = np.vstack([rng.normal(0.0, SAME_M / 3.0, (n_same, 3)), rng.normal(0.0, OTHER_M, (n_other, 3))])
+    away_m = np.abs(np.append(rng.normal(0.0, 0.1, n_same), rng.normal(0.0, 0.5, n_other)))
+    pairs = paired(away_m, size_m, p=0.8)
+    found = box_likeness._maximise(USUAL, pairs, USUAL)
+    np.testing.assert_allclose(found.same_size_m, SAME_M / 3.0, rtol=0.25)
+    p_same = 1.0 / (1.0 + np.exp(-found.log_odds(pairs)[:, 0]))
+    assert (p_same[:n_same] > 0.5).mean() > 0.97
+    assert p_same[n_same:].mean() < p_same[:n_same].mean() - 0.3
