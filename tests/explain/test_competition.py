@@ -11,14 +11,17 @@ from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.errors import NumericalError
 from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.competition import _screen_pairs
 from evermap.explain.evidence import Screen, optimum_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
+from evermap.explain.seeds import find_delay
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
 from evermap.maps.sessions import session
 from evermap.maps.sessions.planar import PlanarVisit
+from evermap.slam.mistakes import USUAL, pairs_of
 from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
 
 from .worlds import SIZE_M, World
@@ -338,3 +341,33 @@ def test_poses_that_are_no_numbers_are_no_result(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(PlanarVisit, "concluded", nowhere)
     with pytest.raises(NumericalError, match="no numbers"):
         run_slam(World().plane(), without_causes())
+
+
+@pytest.mark.parametrize(("kind", "late_s"), [("plane", 3.0), ("plane", -2.0), ("poses", 1.33)])
+def test_a_delay_that_no_score_reaches_is_shown_by_pairs_of_sightings(kind: str, late_s: float) -> None:
+    recording, _ = recorded(World(seed=10), kind)
+    late = replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s)
+    pairs = pairs_of(replace(recording, frames=late))
+    assert pairs is not None
+    assert find_delay(pairs, USUAL) == pytest.approx(late_s, abs=0.05)
+
+
+@pytest.mark.parametrize("late_s", [3.0, -2.0])
+def test_a_clock_that_is_seconds_off_is_named_as_late_as_it_is(late_s: float) -> None:
+    recording, _ = recorded(World(seed=10), "plane")
+    late = replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s)
+    result = run_slam(replace(recording, frames=late))
+    assert named(result, "clock").value == pytest.approx(late_s, abs=0.03)
+    assert result.changes == ()
+    assert error_m(result, recording, in_map=False) < 0.05
+
+
+@pytest.mark.parametrize("world", [World(seed=5, drift=0.04), World(wheels=1.1)])
+def test_clocks_that_are_right_or_nearly_so_are_left_to_scores(world: World) -> None:
+    for recording in (world.plane(), world.space(corners=False)):
+        inputs = Inputs.of(recording, None)
+        clocks = [one for one in list_suspects(inputs) if one.code == "clock"]
+        assert clocks
+        assert _screen_pairs(inputs, clocks, Config().slam) == []
+        near = replace(recording.frames, stamp_s=recording.frames.stamp_s + 0.08)
+        assert _screen_pairs(Inputs.of(replace(recording, frames=near), None), clocks, Config().slam) == []

@@ -30,12 +30,21 @@ from evermap.explain.evidence import (
 )
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
 from evermap.explain.scores import score_session
-from evermap.explain.seeds import FALLS, find_mount, find_scales, find_shape, find_single_scales
+from evermap.explain.seeds import (
+    FALLS,
+    find_delay,
+    find_mount,
+    find_pair_loss,
+    find_scales,
+    find_shape,
+    find_single_scales,
+    late_by,
+)
 from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.explain.symptoms import compare_odometry
 from evermap.slam.check import find_misreadings
 from evermap.slam.estimate import Solved, solve
-from evermap.slam.mistakes import HONEST, off, pairs_of
+from evermap.slam.mistakes import pairs_of
 from evermap.slam.room import ROOM_M
 from evermap.types import (
     UNKNOWN,
@@ -473,7 +482,7 @@ def _plain(
         of_map = [(0.0, one, 0.0) for one in suspects if _is_of_map(one, best, config)]
     seeds = _by_seeds(best, inputs, suspects, config)
     shown = [(math.inf, one, 0.0) for one in suspects if one.shows]
-    return [*shown, *_screen_discrete(inputs, suspects, config), *seeds, *of_map]
+    return [*shown, *_screen_pairs(inputs, suspects, config), *seeds, *of_map]
 
 
 def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspect]) -> Asked | None:
@@ -603,16 +612,22 @@ def _diverse(
     return found
 
 
-def _screen_discrete(
+def _screen_pairs(
     inputs: Inputs, suspects: Iterable[Suspect], config: SlamConfig
 ) -> list[tuple[float, Suspect, float]]:
-    """Return discrete causes that bring pairs of sightings nearer, with what they gain [nats]."""
+    """Return discrete causes, and long delays, that bring pairs of sightings nearer, with what they gain [nats]."""
     rules = config.check
     before = pairs_of(inputs.recording, rules)
     if before is None or before.still:
         return []
-    loss, found = _pair_loss(before, rules.fits), list[tuple[float, Suspect, float]]()
+    loss, found = find_pair_loss(before, rules), list[tuple[float, Suspect, float]]()
+    least = max(rules.gain, FALLS * loss)
     for suspect in suspects:
+        if suspect.code == "clock":
+            state = find_delay(before, rules)
+            gain = loss - find_pair_loss(before, rules, late_by(state))
+            found += [(gain, suspect, state)] if gain > least and abs(state) > FAR * suspect.sigma else []
+            continue
         if suspect.is_continuous or suspect.of_map or not suspect.pairs:
             continue
         try:
@@ -621,16 +636,10 @@ def _screen_discrete(
             continue
         if pairs is None:
             continue
-        gain = loss - _pair_loss(pairs, rules.fits)
-        if gain > max(rules.gain, FALLS * loss):
+        gain = loss - find_pair_loss(pairs, rules)
+        if gain > least:
             found.append((gain, suspect, 0.0))
     return sorted(found, key=lambda each: -each[0])
-
-
-def _pair_loss(pairs: object, fits: float) -> float:
-    """Cauchy loss of pairs of sightings [nats]."""
-    residual = np.minimum(off(pairs.residual(HONEST)), 10.0)  # type: ignore[attr-defined]
-    return float(np.log1p((residual / fits) ** 2).sum())
 
 
 def _screen_continuous(

@@ -14,6 +14,7 @@ from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 
 from evermap.config import ChangesConfig, SlamConfig
 from evermap.estimate.sparse.system import Slices
+from evermap.slam.changes import joint
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
 from evermap.slam.changes.joint import Joint, without_common_motion
 from evermap.slam.method import Explanation
@@ -78,6 +79,25 @@ def test_what_was_thought_on_the_way_can_be_thought_again(with_map: bool) -> Non
     assert all_found(last.changes, WITHIN)
     again = method.revise(last.problem, last.estimate, noise, heavy=False, final=True)
     assert again.problem is last.problem
+
+
+def test_the_whole_is_moved_back_though_some_moved_within_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = make_session(0, WITHIN, with_map=True)
+    method, noise = session.method(), session.world.noise
+    before = method.revise(session.problem, session.static, noise, heavy=True, final=False)
+    extra = len(before.estimate.landmark) - len(session.before)
+    assert extra == len(WITHIN.members)
+    dropped = []
+
+    def without_first(groups: tuple[MovedGroup, ...], *others: object) -> tuple[MovedGroup, ...]:
+        dropped.extend(groups[:1])
+        return groups[1:]
+
+    monkeypatch.setattr(joint, "without_common_motion", without_first)
+    away = before.estimate.moved(np.array([1.0, 2.0, 0.3]))
+    found = method.revise(before.problem, away, noise, heavy=True, final=False)
+    assert dropped
+    assert np.linalg.norm(found.estimate.landmark[[0, 3, 4, 6]] - session.before[[0, 3, 4, 6]], axis=1).max() < 0.1
 
 
 @pytest.mark.slow
