@@ -67,6 +67,8 @@ AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 ODOMETRY_OFF = 0.3
 """Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
+LENGTHS = ("odometry_forward_scale", "odometry_scale")
+"""Calibration states that say how long a drive is by its odometry, in the plane and in space."""
 LENGTH_OFF, ODOMETRY_NOISY = 0.13, 2.5
 """Logarithm of the length of the trajectory over that of the odometry, and its noise over what is usual, from which the
 same is asked: a run that is sound has less."""
@@ -382,7 +384,10 @@ def _is_far_off(state: ParameterEstimate, farthest: float) -> bool:
     """Return whether a state is needed for certain, known which of two it is, and so far from what is stated."""
     if state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
         return False
-    return abs(state.value - state.prior_mean) > farthest * max(state.prior_sigma, state.sigma)
+    off = abs(state.value - state.prior_mean)
+    if state.name in LENGTHS and abs(math.log(max(_ratio_of(state), 1e-9))) > LENGTH_OFF:
+        return off > SURELY * state.sigma  # the run is told not to be sound for it
+    return off > farthest * max(state.prior_sigma, state.sigma)
 
 
 def _ratio_of(state: ParameterEstimate) -> float:
@@ -425,6 +430,8 @@ def _next_cause(
     taken = () if best is None else best.taken
     known = {(one.suspect.code, one.suspect.subject) for one in taken}
     suspects = [one for one in list_suspects(inputs) if (one.code, one.subject) not in known]
+    if not _is_metre_known(inputs):
+        suspects = [one for one in suspects if one.code != "range-scale"]
     tried, winner = set[tuple[str, str]](), None
 
     def ahead(trial: Trial[VisitT]) -> float:
@@ -446,6 +453,19 @@ def _next_cause(
         if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
             return winner
     return winner
+
+
+def _is_metre_known(inputs: Inputs) -> bool:
+    """Return whether a map or a data sheet says which of ranges and odometry measure true metres.
+
+    Where neither does, in the plane, the metre is that of the ranges, and the scale of the odometry holds what the two
+    differ by: that it is the ranges which are off explains as much, and would move all poses.
+    """
+    recording = inputs.recording
+    if is_in_space(recording) or inputs.prior_map is not None:
+        return True
+    sensor = recording.sensor
+    return sensor.kind is not None or sensor.sigma_scale is not None or sensor.sigma_odometer_scale is not None
 
 
 def share_rejected(result: SlamResult) -> float:
