@@ -161,6 +161,8 @@ class Odometry(_Columns):
         forward_mps: (N,) velocity along the robot's x axis.
         lateral_mps: (N,) velocity along its y axis (zeros for a differential drive).
         angular_radps: (N,) turn rate, counter-clockwise positive.
+        is_measured: whether they are the motions that were measured, as of increments and poses, which nothing stamps
+            before they were; velocities may be commanded, which the robot follows late.
     """
 
     stamp_s: FloatArray
@@ -168,6 +170,7 @@ class Odometry(_Columns):
     lateral_mps: FloatArray
     angular_radps: FloatArray
     clock: Clock = Clock.RECORDING
+    is_measured: bool = False
 
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}

@@ -18,7 +18,16 @@ from evermap.pipeline import run_slam
 from evermap.slam.calibration import BEARING, FORWARD, NAMES, SLOPE, SPECS, USUAL, CalibrationPrior, needed
 from evermap.slam.problem import SPANS, Drive, beyond_jitter
 from evermap.slam.smoother import Smoother
-from evermap.types import ParameterEstimate, Recording, Sensor, SensorKind
+from evermap.types import (
+    UNKNOWN,
+    Detections,
+    Frames,
+    Odometry,
+    ParameterEstimate,
+    Recording,
+    Sensor,
+    SensorKind,
+)
 from evermap_studies.worlds.robots import draw_robot, simulate_robot
 
 
@@ -375,10 +384,60 @@ def test_jitter_of_reported_velocities_is_told_from_their_changes():
     stamp = np.arange(0.0, 400.0, 0.05)
     velocity = np.column_stack([0.5 + 0.4 * np.sin(stamp / 3), np.zeros(len(stamp)), np.sign(np.sin(stamp / 7))])
     noise = np.array([0.05, 0.0, 0.1]) * rng.normal(size=velocity.shape)
-    assert np.sqrt(Drive.from_rows(stamp, velocity).jitter) == pytest.approx(np.zeros(3), abs=1e-3)
-    assert np.sqrt(Drive.from_rows(stamp, velocity + noise).jitter) == pytest.approx(
+    assert np.sqrt(Drive.from_rows(stamp, velocity).jitter.mean(axis=0)) == pytest.approx(np.zeros(3), abs=1e-3)
+    assert np.sqrt(Drive.from_rows(stamp, velocity + noise).jitter.mean(axis=0)) == pytest.approx(
         [0.05, 0.0, 0.1], rel=0.05, abs=1e-9
     )
+
+
+def test_what_stands_does_not_jitter():
+    """Slow rows, half of which stand: a jitter of all rows would hide that starts and stops show a delay."""
+    rng = np.random.default_rng(7)
+    stamp = np.arange(0.0, 400.0, 0.5)
+    drives = stamp % 80.0 >= 40.0
+    velocity = np.where(drives, 1.0, 0.0)[:, None] * [1.0, 0.0, 0.2] + 1e-6 * stamp[:, None]
+    noise = drives[:, None] * np.array([0.05, 0.0, 0.02]) * rng.normal(size=(len(stamp), 3))
+    variance = Drive.from_rows(stamp, velocity + noise).jitter[: len(stamp)]
+    inner = np.convolve(drives, np.ones(41), "same")
+    assert variance[inner == 0.0] == pytest.approx(0.0, abs=1e-12)
+    assert np.sqrt(variance[inner == 41.0].mean(axis=0)) == pytest.approx([0.05, 0.0, 0.02], rel=0.15, abs=1e-9)
+
+
+def stopping(late_s: float, seed: int) -> Recording:
+    """A forklift that drives around a square, turns at its corners, and stands for twenty seconds each time around.
+
+    Its odometry has two rows a second; frames are stamped late.
+    """
+    rng = np.random.default_rng(seed)
+    side = [(1.5, 0.0)] * 300 + [(0.8, np.pi / 6.0)] * 150  # fifty a second
+    speed, turn = np.array((side * 4 + [(0.0, 0.0)] * 1000) * 3).T
+    slip = np.repeat(rng.normal(1.0, 0.02, (len(speed) // 50, 2)), 50, axis=0).T
+    heading = np.concatenate([[0.0], np.cumsum(turn) * 0.02])
+    at = np.cumsum(
+        np.vstack([[0.0, 0.0], speed[:, None] * np.array([np.cos(heading[:-1]), np.sin(heading[:-1])]).T * 0.02]), 0
+    )
+    place = at[rng.integers(0, 1500, 40)] + rng.choice([-1.0, 1.0], (40, 2)) * rng.uniform(2.0, 4.0, (40, 2))
+    frame = np.arange(0, len(speed), 10)
+    away = place[None] - at[frame, None]
+    far, bearing = np.hypot(away[..., 0], away[..., 1]), np.arctan2(away[..., 1], away[..., 0]) - heading[frame, None]
+    seen, row = np.nonzero((far < 8.0) & (np.cos(bearing) > 0.8) & (rng.random(far.shape) < 0.8))
+    none, count = np.full(len(seen), np.nan), len(seen)
+    detections = Detections(
+        seen, row, far[seen, row] + rng.normal(0.0, 0.05, count),
+        se2.wrap(bearing[seen, row]) + rng.normal(0.0, 0.01, count),
+        np.full(count, UNKNOWN), none, none, np.zeros(count, dtype=int),
+    )  # fmt: skip
+    driven = (np.array([speed, turn]) * slip).reshape(2, -1, 25).mean(axis=2)
+    odometry = Odometry(0.5 * np.arange(len(driven[0])), driven[0], np.zeros(len(driven[0])), driven[1])
+    return Recording("stops", odometry, Frames(0.02 * frame + late_s), detections, Sensor(0.1, 8.0, -0.65, 0.65))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_stops_show_a_delay_though_the_odometry_is_slow(seed: int):
+    delay = told(stopping(0.2, seed))["odometry_delay_s"]
+    assert delay.p_needed > 0.99
+    assert delay.value == pytest.approx(-0.2, abs=0.03)
+    assert delay.sigma < 0.02
 
 
 def test_a_turn_counts_and_the_jitter_of_its_report_does_not():

@@ -41,7 +41,7 @@ from evermap.explain.seeds import (
     late_by,
 )
 from evermap.explain.shape import FEWEST, compare_shapes
-from evermap.explain.symptoms import compare_odometry
+from evermap.explain.symptoms import SURELY, compare_odometry, find_delay
 from evermap.slam.check import find_misreadings
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import pairs_of
@@ -76,6 +76,8 @@ AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 ODOMETRY_OFF = 0.3
 """Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
+LENGTHS = ("odometry_forward_scale", "odometry_scale")
+"""Calibration states that say how long a drive is by its odometry, in the plane and in space."""
 LENGTH_OFF, ODOMETRY_NOISY = 0.13, 2.5
 """Logarithm of the length of the trajectory over that of the odometry, and its noise over what is usual, from which the
 same is asked: a run that is sound has less."""
@@ -92,6 +94,10 @@ FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
 AXES_OF_TAGS = frozenset({"map-axes", "corner-order"})
 """Causes of a map by which only the orientations of its tags are others: its shape says which may be."""
+LEAST_LATE_S = 0.02
+"""Delay of the sensor's stamps from which poses are put where the robot was when detections were taken."""
+CLOCK = "clock"
+"""Cause of stamps that are late."""
 CHANGES, INNOVATIONS = "changes", "innovations"
 """Symptoms of a session in which landmarks changed, and of one whose detections scatter wider than they should."""
 OF_NOISE = "_noise_factor", "sigma_corner_px"
@@ -265,6 +271,13 @@ def explain(
     Without symptoms the solution is returned as it is.
     """
     rules = config.explain
+    late = None if solution is None else _find_late_sensor(solution.result, inputs)
+    now = None if late is None else _solve_trial(inputs, (), late.suspect, late.state, solve_under, _Budget(1))
+    if late is not None and now is not None and _find_late_sensor(now.solution.result, now.inputs) is None:
+        since = explain(
+            now.inputs, now.solution, solve_under, config, say, is_read_well=is_read_well, is_suspected=is_suspected
+        )
+        return None if since is None else _with_late_sensor(since, late, now.solution.result)
     screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
         symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
@@ -294,6 +307,34 @@ def explain(
     named = {cause.code for cause in causes}
     others = find_put_right(best.solution.result, best.inputs, rules)
     return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
+
+
+def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
+    """Return by how much stamps of the sensor are late, where measured motions in the plane seem early.
+
+    Nothing stamps a motion before it was, so what is late are the detections: at their stamps the robot is not where
+    it was when they were taken. In space delays are those of the sensors.
+    """
+    if is_in_space(inputs.recording) or not inputs.recording.odometry.is_measured:
+        return None
+    delay = find_delay(result)
+    if delay is None or not (delay.p_needed > SURE and -delay.value > max(LEAST_LATE_S, SURELY * delay.sigma)):
+        return None
+    suspect = next(one for one in list_suspects(inputs) if one.code == CLOCK)
+    return Taken(suspect, -delay.value, delay.sigma**-2)
+
+
+def _with_late_sensor(explained: Explained[VisitT], late: Taken, result: SlamResult) -> Explained[VisitT]:
+    """Return what explains a session at its true stamps, with how late those that were given are: by what was taken off
+    them, and by what `result` has left of it.
+    """
+    left = next((one for one in result.parameters if one.name == "odometry_delay_s"), None)
+    suspect, state = late.suspect, late.state - (0.0 if left is None or left.fixed else left.value)
+    cause = Cause(
+        suspect.code, suspect.subject, suspect.say(state), state, late.information**-0.5, 1.0, suspect.fix(state)
+    )
+    best = replace(explained.best, taken=(late, *explained.best.taken))
+    return replace(explained, best=best, causes=(cause, *explained.causes))
 
 
 def _find_score(solution: SessionSolution[VisitT], inputs: Inputs) -> float:
@@ -352,7 +393,10 @@ def _is_far_off(state: ParameterEstimate, farthest: float) -> bool:
     """Return whether a state is needed for certain, known which of two it is, and so far from what is stated."""
     if state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
         return False
-    return abs(state.value - state.prior_mean) > farthest * max(state.prior_sigma, state.sigma)
+    off = abs(state.value - state.prior_mean)
+    if state.name in LENGTHS and abs(math.log(max(_ratio_of(state), 1e-9))) > LENGTH_OFF:
+        return off > SURELY * state.sigma  # the run is told not to be sound for it
+    return off > farthest * max(state.prior_sigma, state.sigma)
 
 
 def _ratio_of(state: ParameterEstimate) -> float:
@@ -395,6 +439,8 @@ def _next_cause(
     taken = () if best is None else best.taken
     known = {(one.suspect.code, one.suspect.subject) for one in taken}
     suspects = [one for one in list_suspects(inputs) if (one.code, one.subject) not in known]
+    if not _is_metre_known(inputs):
+        suspects = [one for one in suspects if one.code != "range-scale"]
     tried, winner = set[tuple[str, str]](), None
 
     def ahead(trial: Trial[VisitT]) -> float:
@@ -416,6 +462,19 @@ def _next_cause(
         if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
             return winner
     return winner
+
+
+def _is_metre_known(inputs: Inputs) -> bool:
+    """Return whether a map or a data sheet says which of ranges and odometry measure true metres.
+
+    Where neither does, in the plane, the metre is that of the ranges, and the scale of the odometry holds what the two
+    differ by: that it is the ranges which are off explains as much, and would move all poses.
+    """
+    recording = inputs.recording
+    if is_in_space(recording) or inputs.prior_map is not None:
+        return True
+    sensor = recording.sensor
+    return sensor.kind is not None or sensor.sigma_scale is not None or sensor.sigma_odometer_scale is not None
 
 
 def share_rejected(result: SlamResult) -> float:
@@ -844,6 +903,7 @@ OWN_STATES = {
 
 def in_given_units(trial: Trial[VisitT]) -> SlamResult:
     """Return the result of a trial, its calibration states as they are of the recording that was given."""
+    late = [one for one in trial.taken if one.suspect.code == CLOCK and not is_in_space(trial.inputs.recording)]
     factor = {
         name: math.exp(sign * one.state) for one in trial.taken for name, sign in OWN_STATES.get(one.suspect.code, ())
     }
@@ -852,10 +912,17 @@ def in_given_units(trial: Trial[VisitT]) -> SlamResult:
             state, value=state.value + (factor[state.name] - 1.0) * _ratio_of(state),
             sigma=state.sigma * factor[state.name],
         )
-        if state.name in factor else state
+        if state.name in factor
+        else _with_delay(state, late) if late and state.name == "odometry_delay_s" else state
         for state in trial.solution.result.parameters
     ]  # fmt: skip
     return replace(trial.solution.result, parameters=tuple(states))
+
+
+def _with_delay(delay: ParameterEstimate, late: Sequence[Taken]) -> ParameterEstimate:
+    """Return the delay of the odometry's stamps against those that were given of the sensor, which were late."""
+    by_s, variance = sum(one.state for one in late), sum(1.0 / one.information for one in late)
+    return replace(delay, value=delay.value - by_s, sigma=max(delay.sigma, math.sqrt(variance)), p_needed=1.0)
 
 
 def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:

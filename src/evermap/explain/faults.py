@@ -18,7 +18,17 @@ from evermap.explain.symptoms import USED, find_motions, find_turns_between
 from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
 from evermap.slam.gaps import find_gaps, is_outside
 from evermap.slam.mistakes import Finding
-from evermap.types import AnyRecording, Cause, FloatArray, IntArray, Landmarks, SlamResult, Trajectory, is_in_space
+from evermap.types import (
+    AnyRecording,
+    Cause,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    ParameterEstimate,
+    SlamResult,
+    Trajectory,
+    is_in_space,
+)
 
 JUMP_M, JUMP_RAD = 0.2, 0.2
 """Difference of odometry and trajectory within a step that is no noise of it [m, rad]."""
@@ -125,12 +135,25 @@ def find_unseen_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[floa
     first, last = first[blind], last[blind]
     shift_m, turn_rad = _differ(*poses, first, last)
     went_m = np.min([np.linalg.norm(find_motions(each, first, last), axis=1) for each in poses], axis=0)
-    # more than the robot went at all: clocks that differ are no jump
+    # more than the robot went at all, and goes until the later clock says so: clocks that differ are no jump
+    went_m += _longest_delay_s(result.parameters) * _find_top_speed(path)
     beyond = shift_m > np.maximum(np.maximum(JUMP_M, went_m), TIMES * usual_m * (last - first))
     rows = np.flatnonzero(beyond)
     rows = rows[np.argsort(-shift_m[rows])]
     found = path.stamp_s[first[rows]], shift_m[rows], turn_rad[rows]
     return list(zip(*(each.tolist() for each in found), strict=True))
+
+
+def _longest_delay_s(parameters: tuple[ParameterEstimate, ...]) -> float:
+    """Return by how much two clocks differ at most, as was estimated."""
+    return max((abs(one.value) for one in parameters if one.name.endswith("_delay_s") and not one.fixed), default=0.0)
+
+
+def _find_top_speed(path: Trajectory) -> float:
+    """Return how fast the robot goes where it goes fast [m/s]: all but a hundredth of the steps are slower."""
+    steps = np.arange(1, len(path))
+    went_m = np.linalg.norm(find_motions(path.pose_world_robot, steps - 1, steps), axis=1)
+    return float(np.quantile(went_m / np.diff(path.stamp_s), 0.99)) if len(steps) else 0.0
 
 
 def _differ(pose: FloatArray, other: FloatArray, first: IntArray, last: IntArray) -> tuple[FloatArray, FloatArray]:

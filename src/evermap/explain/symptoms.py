@@ -523,13 +523,19 @@ OF_DETECTIONS = (
 """Names of noise levels of detections; all others are of the odometry."""
 
 
+def find_delay(result: SlamResult) -> ParameterEstimate | None:
+    """Return the delay of the odometry where it was estimated, as in the plane, and was not put right."""
+    if any((cause.code, cause.subject) == ("clock", "sensor") for cause in result.causes):
+        return None
+    return next((each for each in result.parameters if each.name == "odometry_delay_s" and not each.fixed), None)
+
+
 def _shift_by_clock_m(result: SlamResult) -> float:
     """Return how far the robot goes, by its usual speed, within a long delay between odometry and detections.
 
     Poses are those of the detections' clock: if the odometry's is right, they are off by as much.
     """
-    path = result.trajectory
-    delay = next((each for each in result.parameters if each.name == "odometry_delay_s" and not each.fixed), None)
+    path, delay = result.trajectory, find_delay(result)
     if delay is None or len(path) < 3:
         return nan
     is_late = delay.value > max(LATE_S, SURELY * delay.sigma)

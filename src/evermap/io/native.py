@@ -80,7 +80,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
     class_names = settings.class_names
     if class_names is None:
         class_names = distinct_labels(seen, tables["landmarks"])
-    odometry = _odometry(driven, clock, warnings)
+    odometry = _odometry(driven, clock, warnings, settings.is_measured)
     frames, detections = _frames_and_detections(seen, tables["frames"], class_names, settings, warnings, names)
     recording = Recording(
         name=settings.name or files.title,
@@ -137,7 +137,8 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
     return parse_table(files.read(file), files.path_of(file), warnings)
 
 
-def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
+def _odometry(table: Table, clock: Clock, warnings: list[str], is_measured: bool | None = None) -> Odometry:
+    """Return velocities; increments were measured, unless it is stated otherwise."""
     given = table.one_form(_VELOCITIES, _INCREMENTS)
     if given is _VELOCITIES:
         table.expect(("stamp_s", *_VELOCITIES), ("lateral_mps",))
@@ -156,9 +157,11 @@ def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
             lateral_mps=table.filled(q.LATERAL_MPS, 0.0)[keep],
             angular_radps=table.numbers(q.ANGULAR_RADPS)[keep],
             clock=clock,
+            is_measured=bool(is_measured),
         )
     increments = np.stack([table.numbers(quantity) for quantity in (q.DX_M, q.DY_M, q.DTHETA_RAD)], axis=1)
-    return _from_increments(stamp_s, increments, table, clock, warnings)
+    driven = _from_increments(stamp_s, increments, table, clock, warnings)
+    return replace(driven, is_measured=is_measured is not False)
 
 
 def _from_increments(

@@ -139,6 +139,7 @@ def _contents(recording: Recording | SpatialRecording) -> tuple[dict[str, str], 
         sensor=recording.sensor,
     )
     if not is_in_space(recording):
+        settings = replace(settings, is_measured=recording.odometry.is_measured or None)
         return {SENSOR_FILE: sensor_toml(settings)}, native_tables(recording)
     known = {name: said for name, said in recording.symmetries.items() if name in _class_names(recording)}
     return rig_toml(recording.sensors, settings, known), native_tables(recording)

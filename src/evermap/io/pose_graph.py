@@ -484,7 +484,7 @@ def _in_plane(
         truth = Trajectory(stamp_s, pose, np.zeros((len(pose), 3, 3)), frame="truth", clock=clock)
     return Recording(
         name="",
-        odometry=Odometry(stamp_s, forward, lateral, angular, clock=clock),
+        odometry=Odometry(stamp_s, forward, lateral, angular, clock=clock, is_measured=True),
         frames=Frames(stamp_s, complete=False, clock=clock),
         detections=detections,
         truth=truth,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import inf, pi
 from pathlib import Path
@@ -38,6 +38,8 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     },
     "odometry": {"sigma_odometer_scale": (0.0, 1.0), "sigma_askew_rad": (0.0, 2 * pi)},
 }
+_OTHERS = {"sensor": ("kind",), "odometry": ("measured",)}
+"""Keys that are no numbers."""
 _RECORDING = ("format_version", "name", "robot", "clock", "frames_complete", "class_names")
 
 
@@ -51,6 +53,7 @@ class Settings:
     frames_complete: bool | None = None
     class_names: tuple[str, ...] | None = None
     sensor: Sensor = field(default_factory=Sensor)
+    is_measured: bool | None = None
 
 
 def parse_sensor_toml(data: bytes, path: Path) -> Settings:
@@ -63,9 +66,12 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
     reader.expect(("recording", *_LIMITS), reader.document, section=None)
     values: dict[str, dict[str, float]] = {}
     for section, keys in _LIMITS.items():
-        content = reader.section(section, ("kind", *keys) if section == "sensor" else tuple(keys))
+        content = reader.section(section, (*_OTHERS.get(section, ()), *keys))
         values[section] = reader.limited(section, content, keys)
-    return reader.recording(_sensor(values, reader))
+    measured = reader.document.get("odometry", {}).get("measured")
+    if not isinstance(measured, bool | None):
+        raise reader.error("odometry", "measured", f"must be a bool, not {type(measured).__name__}")
+    return replace(reader.recording(_sensor(values, reader)), is_measured=measured)
 
 
 def sensor_toml(settings: Settings) -> str:
@@ -77,6 +83,7 @@ def sensor_toml(settings: Settings) -> str:
         "sensor": {key: getattr(sensor, key) for key in ("kind", *_LIMITS["sensor"])},
         "mount": dict(zip(_LIMITS["mount"], sensor.mount_robot_sensor, strict=True)),
     }
+    sections["odometry"]["measured"] = settings.is_measured
     return toml_text(sections)
 
 

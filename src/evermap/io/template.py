@@ -76,6 +76,7 @@ p_false = 0.001            # probability of a false detection in a frame
 # [odometry]
 # sigma_odometer_scale = 0.01
 # sigma_askew_rad = 0.002  # of the angle between driving direction and front
+# measured = true          # the velocities are the wheels' own, not commands, which the robot follows late
 """
 
 _COMMENTS = {

@@ -249,7 +249,9 @@ def velocities_of(odometry: SpatialOdometry) -> Odometry:
     pose = plane_of(odometry.pose_world_robot)
     velocity = se2.log(se2.between(pose[:-1], pose[1:])) / step_s[:, None]
     forward, lateral, angular = np.vstack([velocity, velocity[-1:]]).T
-    return Odometry(odometry.stamp_s, forward.copy(), lateral.copy(), angular.copy(), clock=odometry.clock)
+    return Odometry(
+        odometry.stamp_s, forward.copy(), lateral.copy(), angular.copy(), clock=odometry.clock, is_measured=True
+    )
 
 
 def plane_of(pose: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray, Reco
 
 USUAL = OdometryConfig()
 FEWEST_ROWS = 20
-"""Rows of odometry from which its jitter is estimated."""
+"""Rows of odometry from which its jitter is estimated, of all and around each."""
 TURN_ROWS = 5
 """Rows of odometry in a span from which its jitter is told."""
 SPANS = 2
@@ -50,14 +50,26 @@ class Drive:
 
     @property
     def jitter(self) -> FloatArray:
-        """(3,) variance of what in the velocities is another from row to row: noise of the report, not of the motion.
+        """(n, 3) variance of what in the velocities is another from row to row: noise of the report, not of the motion.
 
-        By second differences, the largest tenth left out: a robot that starts or stops does not jitter.
+        By second differences of the rows around each, the largest tenth of all left out: a robot that starts or stops
+        does not jitter, nor does one that stands, where the odometry is exact.
         """
         if len(self.velocity) < FEWEST_ROWS:
-            return np.zeros(3)
-        square = np.sort(np.diff(self.velocity[:, :3], n=2, axis=0) ** 2, axis=0)[: int(0.9 * (len(self.velocity) - 2))]
-        return np.asarray(square.mean(axis=0) / (6.0 * TRIMMED))
+            return np.zeros((len(self.velocity), 3))
+        square = np.diff(self.velocity[:, :3], n=2, axis=0) ** 2
+        kept = square <= np.quantile(square, 0.9, axis=0)
+        totals = np.zeros((2, len(square) + 1, 3))
+        totals[:, 1:] = np.cumsum([np.where(kept, square, 0.0), kept], axis=1)
+        middle = np.arange(len(self.velocity)) - 1  # of the second difference that is centred at a row
+        first = np.clip(middle - FEWEST_ROWS // 2, 0, len(square))
+        last = np.clip(middle + FEWEST_ROWS // 2 + 1, 0, len(square))
+        around, count = totals[:, last] - totals[:, first]
+        return np.asarray(around / np.maximum(count, 1.0) / (6.0 * TRIMMED))
+
+    def rows_at(self, stamp_s: FloatArray) -> IntArray:
+        """Return (N,) rows of the velocities that hold at stamps (N,), on the odometry's clock."""
+        return np.clip(np.searchsorted(self.stamp_s, stamp_s, side="right") - 1, 0, len(self.stamp_s) - 1)
 
     def is_alike(self, other: Drive) -> bool:
         """Return whether another has the same rows."""

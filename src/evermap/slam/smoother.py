@@ -154,7 +154,10 @@ class Smoother(Solver[Estimate]):
         worth += np.where(free, by_curves / np.where(free, np.diag(marginals.states), 1.0), 0.0)
         # the delay shows where the velocity changes; where it only jitters, no delay explains it
         driven = now.values[structure.values_of(ODOMETRY)].reshape(-1, 3, OF_INTERVAL)
-        jitter = 2.0 * (driven[..., 3:6] ** 2).sum(axis=(0, 1)) @ problem.drive.jitter
+        row = problem.drive.rows_at(problem.stamp_s + estimate.states[DELAY])
+        variance = problem.drive.jitter[row]
+        of_both = np.where((row[1:] > row[:-1])[:, None], variance[1:] + variance[:-1], 0.0)  # one row is no change
+        jitter = float(((driven[..., 3:6] ** 2).sum(axis=1) * of_both).sum())
         changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
         worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)
         return worth

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betaln
 
 from evermap.config import LivingConfig, LooksConfig, SightConfig
 from evermap.existence.sites import SiteLooks
@@ -32,6 +33,10 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 USUAL = LooksConfig()
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
+FEWEST_IN_SIGHT = 5
+"""Places that were seen, from which it is learned from how much of where they are in view places are in sight."""
+SHARES = np.geomspace(0.25, 64.0, 25)
+"""Parameters of the beta distribution of that share which are weighed, all alike (both are a number of positions)."""
 USUAL_RANGE = 0.9
 """Share of the detections within whose range a miss says something: data sheets promise more."""
 EXPECTED = 1.5
@@ -436,3 +441,60 @@ def flanked_misses(
         each = settings.p_flanked_hidden + (1.0 - settings.p_flanked_hidden) * np.exp(log_missed)
         p_missed[place] = max(float(np.prod(each)), settings.p_always_hidden)
     return flanked, p_missed
+
+
+def misses_in_the_open(
+    watch: Watch, floor_m: FloatArray, unseen: BoolArray, settings: LooksConfig = USUAL
+) -> tuple[BoolArray, FloatArray]:
+    """Return which looks at places that were never detected count, and (P,) how probable all these misses are if
+    something stands there that is in sight from as many positions as what was seen.
+
+    From which share of the positions in whose nominal view it lies a place is in sight, is another for each: beta
+    distributed, as what was seen says, each of it known to be in sight at least once (a beta-binomial, truncated at
+    zero). Besides, some places are in sight from nowhere, behind walls or in rooms that were not entered. How many is
+    learned, too: where much of a map was not seen, it is not all gone. What a place itself says does not count for it.
+
+    Args:
+        watch: looks of a session.
+        floor_m: (P, 2) places.
+        unseen: (P,) whether a place was never detected.
+        settings: what counts.
+    """
+    every, count = watch.listed, len(floor_m)
+    range_m = np.linalg.norm(floor_m[every.landmark] - watch.eye[every.pose, :2], axis=1)
+    near = range_m <= (np.quantile(range_m[every.hit], USUAL_RANGE) if every.hit.any() else 0.0)
+    listed = every.rows(near)
+    position = np.floor(watch.eye[listed.pose, :2] / settings.elsewhere_m).astype(np.int64)
+    cells, cell = np.unique(np.column_stack([listed.landmark, position]), axis=0, return_inverse=True)
+    expected = np.bincount(cell.ravel(), listed.p_detect, minlength=len(cells))
+    hit = np.bincount(cell.ravel(), listed.hit, minlength=len(cells)) > 0
+    of = cells[:, 0][looked := (expected >= EXPECTED) | hit]
+    n, x = np.bincount(of, minlength=count), np.bincount(of, hit[looked], minlength=count)
+    known = ~unseen & (x > 0)
+    asked = unseen & (n > 0)
+    p_missed = np.ones(count)
+    if np.count_nonzero(known) >= FEWEST_IN_SIGHT and asked.any():
+        by_chance = _p_never_in_sight(x[known], n[known], n[asked])
+        hidden = np.geomspace(settings.p_always_hidden, 0.99, 40)[:, None]
+        missed = hidden + (1.0 - hidden) * by_chance  # (H, A) of what stands there
+        each = np.log(settings.p_gone + (1.0 - settings.p_gone) * missed)
+        rest = each.sum(axis=1, keepdims=True) - each
+        fit = rest + np.count_nonzero(known) * np.log1p(-hidden) - 0.5 * np.log(hidden)
+        weight = np.exp(fit - fit.max(axis=0))
+        p_missed[asked] = (weight * missed).sum(axis=0) / weight.sum(axis=0)
+    return near & asked[every.landmark], np.maximum(p_missed, settings.p_always_hidden)
+
+
+def _p_never_in_sight(seen: IntArray, of_seen: IntArray, positions: IntArray) -> FloatArray:
+    """Return (A,) how probable it is that a place that is in view from so many positions (A,) is in sight from none.
+
+    Args:
+        seen: (K,) positions from which each of some places was seen, at least one.
+        of_seen: (K,) positions from which it was in view.
+        positions: (A,) those of the places that are asked for.
+    """
+    a, b = (grid.ravel()[:, None] for grid in np.meshgrid(SHARES, SHARES))
+    none = np.exp(betaln(a, b + of_seen) - betaln(a, b))
+    fit = betaln(a + seen, b + of_seen - seen) - betaln(a, b) - np.log1p(-np.minimum(none, 1.0 - 1e-12))
+    weight = np.exp(fit.sum(axis=1) - fit.sum(axis=1).max())
+    return np.asarray((weight / weight.sum()) @ np.exp(betaln(a, b + positions) - betaln(a, b)))

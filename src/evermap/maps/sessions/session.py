@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -27,6 +28,7 @@ from evermap.maps.sessions.looks import (
     arrivals,
     flanked_misses,
     looked_at,
+    misses_in_the_open,
 )
 from evermap.maps.sessions.placing import ANYWAY, Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
@@ -42,6 +44,7 @@ from evermap.slam.space.up import with_known_up
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
+    ChangeKind,
     Detections,
     FloatArray,
     Landmarks,
@@ -527,7 +530,7 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
 
 def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingConfig) -> SlamResult:
     """Return the result of a recording in a given map with the entries of that which were never detected: the looks
-    that missed them, and among `gone` those that are not believed to be there.
+    that missed them; and those that are not believed to be there among `gone`, and as changes that are told.
 
     What was detected is where the result has it; the beliefs about it stay as they are.
     """
@@ -560,6 +563,9 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     asked = np.isin(names, unseen.landmark_id)
     oriented = np.zeros(len(names), dtype=np.bool_) if rotation is None else np.isfinite(living.places.rotation[:, 0])
     flanked, p_missed = flanked_misses(watch, floor_m, asked, oriented, config.looks)
+    in_the_open, p_open = misses_in_the_open(watch, floor_m, asked, config.looks)
+    flanked |= in_the_open & (p_open < p_missed)[watch.listed.landmark]
+    p_missed = np.minimum(p_missed, p_open)
     row = np.searchsorted(names, unseen.landmark_id)  # one place each, in the order of their names
     p_gone = config.looks.p_gone
     p_exists = p_missed[row] * (1.0 - p_gone) / (p_missed[row] * (1.0 - p_gone) + p_gone)
@@ -569,7 +575,17 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     every = rows_of(every, np.lexsort((every.landmark_id, every.frame)))
     unseen = replace(unseen, p_exists=p_exists, n_misses=np.bincount(which, minlength=len(names))[row])
     gone = replace(unseen[p_exists < EXISTS], frame=found.frame)
-    return replace(slam, misses=every, gone=gone if len(gone) else slam.gone)
+    if not len(gone):
+        return replace(slam, misses=every)
+    nowhere = (math.nan,) * given.position_m.shape[1]
+    told = tuple(
+        MapChange((identity,), ChangeKind.VANISHED, math.nan, visit.span_s[0], nowhere, 0.0, 1.0 - p, 0, misses)
+        for identity, p, misses in zip(
+            gone.landmark_id.tolist(), gone.p_exists.tolist(), gone.n_misses.tolist(), strict=True
+        )
+    )
+    told = tuple(one.named(given.names) for one in told)
+    return replace(slam, misses=every, gone=gone, changes=(*slam.changes, *told))
 
 
 def judged_so_far(
