@@ -86,9 +86,9 @@ format: $(DEVELOPMENT)
 docs: $(RUNTIME) $(DOCUMENTATION)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
-# What the pages tell to type; all else of tests/docs is in `make test`.
+# What the pages tell to type, the longest first; all else of tests/docs is in `make test`.
 docs-check: $(DEVELOPMENT)
-	$(PYTEST) tests/docs -m slow
+	$(PYTEST:worksteal=load) --maxschedchunk 1 tests/docs -m slow
 
 bench: $(DEVELOPMENT)
 	$(VENV)/bin/evermap bench

@@ -19,11 +19,14 @@ from pathlib import Path
 
 import pytest
 
+from .warm_commands import warm_commands
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 GENERATED = "reference/"
 """Pages that exist only in the site; `mkdocs build --strict` checks what leads there."""
 TIMEOUT_S = 300
+LONG = re.compile(r"evermap (?:demo|slam(?! --init)|simulate|check|live)")
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,24 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PATH": path, "PYTHONPATH": source, "MPLBACKEND": "agg", "NO_COLOR": "1"}
 
 
+def longest_first(pages: list[Path]) -> list[Path]:
+    """By their number of solutions, which take most of the time; with the long ones last a process would wait."""
+    cost = {page: sum(not block.skipped and len(LONG.findall(block.text)) for block in blocks(page)) for page in pages}
+    return sorted(pages, key=lambda page: -cost[page])
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[dict[str, str]]:
+    """The environment in which `evermap` is ready, see there."""
+    with warm_commands(environment()) as ready:
+        yield ready
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", longest_first(PAGES), ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """The README's commands start as a newcomer's do, those of other pages in a process that is ready."""
+    typed_in = environment() if page.name == "README.md" else request.getfixturevalue("warm")
     recordings = {path.name: path for path in (REPOSITORY.parent / "shared" / "data").rglob("*") if path.is_file()}
     for block in blocks(page):
         if block.skipped:
@@ -91,7 +109,7 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
         done = subprocess.run(
             block.command(),
             cwd=tmp_path,
-            env=environment(),
+            env=typed_in,
             capture_output=True,
             text=True,
             timeout=TIMEOUT_S,
@@ -99,6 +117,22 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
         )
         where = f"{page.relative_to(REPOSITORY)}:{block.line}"
         assert done.returncode == 0, f"{where}: exit {done.returncode}\n{block.text}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "line", ["evermap slam missing --out out", "evermap slam --no-such-option", "evermap --version", "evermap map log"]
+)
+def test_a_command_that_is_ready_ends_as_the_installed_one(line: str, tmp_path: Path, warm: dict[str, str]) -> None:
+    """Exit code and streams; above all, what fails does fail."""
+    ends = [
+        subprocess.run(["bash", "-c", f"cat | {line} | cat; exit ${{PIPESTATUS[1]}}"], cwd=tmp_path, env=env,
+                       input="", capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+        for env in (environment(), warm)
+    ]  # fmt: skip
+    fresh, ready = ((end.returncode, end.stdout, end.stderr) for end in ends)
+    assert ready == fresh
+    assert ready[0] == (0 if line.endswith("--version") else 2)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))

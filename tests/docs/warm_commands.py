@@ -1,0 +1,114 @@
+"""The command `evermap` for the documents' checks: copies of a process that has imported it and loaded its kernels.
+
+Of the seconds of most commands of the pages, the greater part goes into imports and into loading machine code, a
+hundred times the same. So one process does that, and each command is a fork of it, with the folder, the environment
+and the streams of its caller, and ends as the installed command does. It is `evermap.__main__.run` in both; that this
+starts in a fresh process is what the README's commands show, which are run without this.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+SHIM = """#!{python} -IS
+import json, os, socket, sys
+with socket.socket(socket.AF_UNIX) as to:
+    to.connect({address!r})
+    socket.send_fds(to, [b"-"], [0, 1, 2])
+    to.sendall(json.dumps([sys.argv, os.getcwd(), dict(os.environ)]).encode())
+    to.shutdown(socket.SHUT_WR)
+    sys.exit(int(to.recv(8) or b"70"))
+"""
+"""What stands for the installed command; an answer that does not come is a failure of the machinery: 70."""
+
+
+@contextmanager
+def warm_commands(environment: dict[str, str]) -> Iterator[dict[str, str]]:
+    """Yield the environment in which `evermap` is a fork of a process that is ready; it ends with the block."""
+    with tempfile.TemporaryDirectory(prefix="evermap-warm-") as folder:
+        address, shim = Path(folder, "socket"), Path(folder, "bin", "evermap")
+        shim.parent.mkdir()
+        shim.write_text(SHIM.format(python=sys.executable, address=str(address)), encoding="utf-8")
+        shim.chmod(shim.stat().st_mode | stat.S_IXUSR)
+        with subprocess.Popen(
+            [sys.executable, __file__, str(address)], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                assert process.stdout is not None
+                assert process.stdout.readline() == "ready\n"
+                yield {**environment, "PATH": os.pathsep.join([str(shim.parent), environment["PATH"]])}
+            finally:
+                process.terminate()
+
+
+def prepare() -> None:
+    """Run what most pages do once, for its imports and kernels, and forget how it ended."""
+    from evermap import interrupts
+    from evermap.cli.main import run
+
+    for line in ("slam --init plane", "slam plane --map a", "slam --init space --3d", "slam space --out b"):
+        sys.argv = ["evermap", *line.split()]
+        with suppress(SystemExit):
+            run()
+        assert interrupts._exit_code == [0], line
+        interrupts._exit_code.clear()  # else a fork that fails would end with it
+        interrupts._kept.clear()
+    assert threading.active_count() == 1, "a fork has one thread, and waits for the others for ever"
+
+
+def answer(caller: socket.socket) -> None:
+    """Run the caller's command in a fork of this process, and send its exit code."""
+    _, streams, _, _ = socket.recv_fds(caller, 1, 3)
+    argv, folder, environment = json.loads(b"".join(iter(lambda: caller.recv(1 << 16), b"")))
+    child = os.fork()
+    if child:
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        caller.sendall(str(status if status >= 0 else 128 - status).encode())
+        os._exit(0)
+    caller.close()
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+        os.close(stream)
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.argv = argv
+    from evermap.__main__ import run
+
+    run()
+
+
+def serve(address: str) -> None:
+    """Answer each caller in a process of its own, until terminated."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(address)
+        server.listen(16)
+        os.write(1, b"ready\n")
+        while True:
+            caller, _ = server.accept()
+            if os.fork() == 0:
+                server.close()
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                answer(caller)
+                return
+            caller.close()
+
+
+if __name__ == "__main__":
+    address, out = sys.argv[1], os.dup(1)
+    os.dup2(2, 1)  # what is printed while it prepares is not for the caller
+    prepare()
+    os.dup2(out, 1)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel forgets callers that were answered
+    serve(address)
