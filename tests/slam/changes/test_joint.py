@@ -80,6 +80,17 @@ def test_what_was_thought_on_the_way_can_be_thought_again(with_map: bool) -> Non
     assert again.problem is last.problem
 
 
+def test_places_of_what_moved_within_a_session_are_no_entries_of_the_map() -> None:
+    """The whole is laid over the map by first places, though landmarks have more than one by then."""
+    session = make_session(0, WITHIN)
+    truth = session.world.truth
+    twice = replace(truth, landmark=np.vstack([session.before, session.after[[1, 2, 5]]]))
+    off = twice.moved(np.array([1.5, -0.7, 0.6]))
+    laid = session.method()._where_most_agree(off)
+    np.testing.assert_allclose(laid.landmark, twice.landmark, atol=0.05)
+    np.testing.assert_allclose(laid.pose[:, :2], truth.pose[:, :2], atol=0.05)
+
+
 @pytest.mark.slow
 @pytest.mark.experiment
 @pytest.mark.parametrize("with_map", [True, False])

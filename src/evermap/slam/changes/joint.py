@@ -105,8 +105,9 @@ class Joint(Method):
     def _where_most_agree(self, estimate: Estimate) -> Estimate:
         """The whole moved to where most landmarks are at their places: those seen first may have been the others."""
         assert self._given is not None
-        both = self._given.given & estimate.known
-        motion, agree = find_consensus(Matches.of(estimate.landmark[both], self._given.mean[both]))
+        first = self._first_places(estimate)  # later ones of what moved are no entries of the map
+        both = self._given.given & first.known
+        motion, agree = find_consensus(Matches.of(first.landmark[both], self._given.mean[both]))
         if np.count_nonzero(agree) < 2:
             return estimate
         return estimate.moved(motion)
