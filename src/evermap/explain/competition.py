@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import product
 from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -766,21 +765,19 @@ def _refined(
     """Return the trial with the state of its last cause at its optimum, and the information on it.
 
     A step is asked with the map as given, and with what the solution let go of it: what is off by much is an outlier of
-    the one, and what changes explain does not show in the other. That which knows more of the state is tried first.
+    the one, and what changes explain does not show in the other. That which knows more of the state is tried.
     """
     asked, stretch = 0.0, 1.0
     while trial.taken[-1].suspect.is_continuous:
-        steps = _find_steps(trial, before)
-        if not steps:
+        step = _find_step(trial, before)
+        if step is None:
             break
-        last = replace(trial.taken[-1], information=steps[0].information)
+        last = replace(trial.taken[-1], information=step.information)
         trial = _with_last(trial, last)
+        # a step that is no shorter than the one before says that what is rejected yet hides how far it is
+        longer = step.value * asked > SHORTER * asked**2
         suspect, nearer = last.suspect, None
-        for step, longer in product(steps, (True, False)):
-            # a step that is no shorter than the one before says that what is rejected yet hides how far it is
-            if longer and not step.value * asked > SHORTER * asked**2:
-                continue
-            length = 2.0 * stretch if longer else 1.0
+        for length in (2.0 * stretch, 1.0) if longer else (1.0,):
             by = float(np.clip(length * step.value, -suspect.sigma, suspect.sigma))
             if abs(by) * math.sqrt(step.information) < NEAR * 0.5:
                 continue
@@ -797,9 +794,9 @@ def _refined(
     return trial
 
 
-def _find_steps(trial: Trial[VisitT], before: Inputs) -> list[Score]:
-    """Return what the state of the last cause of a trial does with the map as given, and with what was let go of it
-    where anything was: that which knows more of it first.
+def _find_step(trial: Trial[VisitT], before: Inputs) -> Score | None:
+    """Return what the state of the last cause of a trial does with the map as given, or with what was let go of it:
+    of either, what knows more of it; None if it changes what is used.
     """
     last, session = trial.taken[-1], trial.solution.session
     held, known, found = held_by_map(session), last.suspect.sigma**-2, list[Score]()
@@ -809,7 +806,7 @@ def _find_steps(trial: Trial[VisitT], before: Inputs) -> list[Score]:
         if direction is not None:
             score = screen.score(direction, known, last.state)
             found.append(score._replace(information=known + (score.information - known) * screen.optimum.worth))
-    return sorted(found, key=lambda score: -score.information)
+    return max(found, key=lambda score: score.information, default=None)
 
 
 def _with_last(trial: Trial[VisitT], last: Taken) -> Trial[VisitT]:
