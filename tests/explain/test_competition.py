@@ -10,8 +10,9 @@ import pytest
 from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.errors import NumericalError
-from evermap.explain.causes import Inputs, list_suspects
-from evermap.explain.competition import _screen_pairs
+from evermap.explain import competition
+from evermap.explain.causes import Inputs, Suspect, list_suspects
+from evermap.explain.competition import SessionSolution, Solve, Trial, _screen_pairs
 from evermap.explain.evidence import Screen, optimum_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
 from evermap.explain.seeds import find_delay
@@ -21,6 +22,7 @@ from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
 from evermap.maps.sessions import session
 from evermap.maps.sessions.planar import PlanarVisit
+from evermap.maps.sessions.session import Visit
 from evermap.slam.mistakes import USUAL, pairs_of
 from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
 
@@ -318,6 +320,55 @@ def test_a_step_that_rejects_detections_says_as_much_as_a_fine_one() -> None:
             assert coarse is not None
             assert fine is not None
             assert np.linalg.norm(coarse - fine) < 0.1 * np.linalg.norm(fine), suspect.subject
+
+
+def trial_under(inputs: Inputs, suspect: Suspect, state: float) -> tuple[Trial[Visit], Solve[Visit]]:
+    """A trial of one cause at a state, and what solves others."""
+
+    def solve_under(given: Inputs) -> SessionSolution[Visit]:
+        visit = session.solved(given.recording, Config(), given.prior_map, ())
+        return SessionSolution(visit, session.solution_of(visit), visit.concluded())
+
+    trial = competition._solve_trial(inputs, (), suspect, state, solve_under, competition._Budget(1))
+    assert trial is not None
+    return trial, solve_under
+
+
+@pytest.mark.parametrize(
+    ("world", "name", "state", "true", "within"),
+    [
+        (World(seed=3, sizes={5: 1.3}), ("tag-size", "5"), 0.6 * np.log(1.3), np.log(1.3), 0.005),
+        # of a lens the state is set, not added to what is stated, and k2 is another than its square
+        (World(seed=8, bent=-0.2), ("distortion", "front, back"), -0.23, -0.2, 0.02),
+    ],
+)
+def test_a_cause_is_refined_until_it_leaves_nothing_to_changes(
+    world: World, name: tuple[str, str], state: float, true: float, within: float
+) -> None:
+    inputs = Inputs.of(*recorded(world, "corners"))
+    suspect = next(one for one in list_suspects(inputs, discrete=False) if (one.code, one.subject) == name)
+    trial, solve_under = trial_under(inputs, suspect, state)
+    assert trial.solution.result.changes != ()
+    budget = competition._Budget(6)
+    found = competition._refined(trial, inputs, (), solve_under, budget)
+    assert found.solution.result.changes == ()
+    assert found.taken[-1].state == pytest.approx(true, abs=within)
+    assert budget.left > 0  # it stopped where no step is long
+
+
+def test_a_state_of_a_lens_that_was_undone_changes_residuals_smoothly() -> None:
+    """It is set, not added: a step from what was undone already would go back to no distortion at all."""
+    inputs = Inputs.of(*recorded(World(seed=8, bent=-0.2), "corners"))
+    suspect = next(one for one in list_suspects(inputs, discrete=False) if one.code == "distortion")
+    trial, _ = trial_under(inputs, suspect, -0.2)
+    solved, screen = trial.solution.session, Screen.of(optimum_of(trial.solution.session))
+    coarse, fine = (
+        change_by(solved, screen, trial.inputs, suspect, share, given=inputs, state=-0.2) for share in (STEP, FINE_STEP)
+    )
+    assert coarse is not None
+    assert fine is not None
+    good = screen.root > 0.5
+    assert np.linalg.norm((coarse - fine)[good]) < 0.1 * np.linalg.norm(fine[good])
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -22,6 +22,7 @@ from evermap.explain.causes import LITTLE, MOUNT_M, Inputs, Suspect, list_suspec
 from evermap.explain.evidence import (
     LOG_2PI,
     AnySession,
+    Score,
     Screen,
     SpatialSession,
     evidence_at,
@@ -41,7 +42,7 @@ from evermap.explain.seeds import (
     late_by,
 )
 from evermap.explain.shape import FEWEST, compare_shapes
-from evermap.explain.symptoms import SURELY, compare_odometry, find_delay
+from evermap.explain.symptoms import SURELY, compare_odometry, find_odometry_delay
 from evermap.slam.check import find_misreadings
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import pairs_of
@@ -61,6 +62,8 @@ from evermap.types import (
 VisitT = TypeVar("VisitT")
 NEAR = 2.0
 """Standard deviations within which a state is refined no further."""
+SHORTER = 0.5
+"""Share of the step before from which a step towards the best state is no shorter: as those of Newton are nearby."""
 FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
 LEAST_SCALE, LEAST_SINGLE = 0.015, 0.05
@@ -159,6 +162,11 @@ class Trial(Generic[VisitT]):
         if max(self.noise, other.noise) > IGNORED and min(self.noise, other.noise) < HEARD:
             return (IGNORED_NATS if self.noise < other.noise else -IGNORED_NATS) + price
         return (self.evidence - other.evidence - price) * min(self.worth, other.worth) + price
+
+    @cached_property
+    def unexplained(self) -> float:
+        """What the calibration that earns most would gain yet, of those that move the poses [nats]."""
+        return _find_score(self.solution, self.inputs)
 
 
 @dataclass(frozen=True)
@@ -317,7 +325,7 @@ def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
     """
     if is_in_space(inputs.recording) or not inputs.recording.odometry.is_measured:
         return None
-    delay = find_delay(result)
+    delay = find_odometry_delay(result)
     if delay is None or not (delay.p_needed > SURE and -delay.value > max(LEAST_LATE_S, SURELY * delay.sigma)):
         return None
     suspect = next(one for one in list_suspects(inputs) if one.code == CLOCK)
@@ -502,7 +510,7 @@ def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> 
         return True
     if not {*before, *after} <= {CHANGES}:
         return False
-    return _find_score(trial.solution, trial.inputs) < FEWER * _find_score(best.solution, best.inputs)
+    return trial.unexplained < FEWER * best.unexplained
 
 
 def _solve_alone(
@@ -760,7 +768,7 @@ def _may_relieve(session: AnySession, inputs: Inputs, suspect: Suspect, state: f
     if usual <= rules.innovations or rejected < FEWER * _find_fit(session)[1]:
         return True
     screen = Screen.of(optimum_of(near))
-    direction = change_by(near, screen, undone, suspect)
+    direction = change_by(near, screen, undone, suspect, given=inputs, state=state)
     if direction is None:
         return True
     score, known = screen.score(direction, suspect.sigma**-2, state), suspect.sigma**-2
@@ -822,33 +830,51 @@ def _refined(
     solve_under: Solve[VisitT],
     budget: _Budget,
 ) -> Trial[VisitT]:
-    """Return the trial with the state of its last cause at its optimum, and the information on it."""
-    last = trial.taken[-1]
-    suspect, stretch = last.suspect, 1.0
-    while suspect.is_continuous:
-        session = held_by_map(trial.solution.session)
-        screen = Screen.of(optimum_of(session))
-        direction = change_by(session, screen, trial.inputs, suspect)
-        if direction is None:
+    """Return the trial with the state of its last cause at its optimum, and the information on it.
+
+    A step is asked with the map as given, and with what the solution let go of it: what is off by much is an outlier of
+    the one, and what changes explain does not show in the other. That which knows more of the state is tried.
+    """
+    asked, stretch = 0.0, 1.0
+    while trial.taken[-1].suspect.is_continuous:
+        step = _find_step(trial, before)
+        if step is None:
             break
-        score = screen.score(direction, suspect.sigma**-2, last.state)
-        worth = screen.optimum.worth
-        information = suspect.sigma**-2 + (score.information - suspect.sigma**-2) * worth
-        trial = _with_last(trial, replace(last, information=information))
-        step = float(np.clip(stretch * score.value, -suspect.sigma, suspect.sigma))
-        if abs(step) * math.sqrt(information) < NEAR * 0.5 or budget.left <= 0:
-            break
-        nearer = _solve_trial(before, taken, suspect, last.state + step, solve_under, budget)
+        last = replace(trial.taken[-1], information=step.information)
+        trial = _with_last(trial, last)
+        # a step that is no shorter than the one before says that what is rejected yet hides how far it is
+        longer = step.value * asked > SHORTER * asked**2
+        suspect, nearer = last.suspect, None
+        for length in (2.0 * stretch, 1.0) if longer else (1.0,):
+            by = float(np.clip(length * step.value, -suspect.sigma, suspect.sigma))
+            if abs(by) * math.sqrt(step.information) < NEAR * 0.5:
+                continue
+            there = _solve_trial(before, taken, suspect, last.state + by, solve_under, budget)
+            if there is None:
+                continue
+            there = _with_last(there, replace(there.taken[-1], information=step.information))
+            if there.evidence > trial.evidence:
+                nearer, asked, stretch = there, step.value, length
+                break
         if nearer is None:
             break
-        nearer = _with_last(nearer, replace(nearer.taken[-1], information=information))
-        if nearer.evidence <= trial.evidence:
-            if stretch == 1.0:
-                break
-            stretch = 1.0
-            continue
-        trial, last, stretch = nearer, nearer.taken[-1], 2.0 * stretch  # what is rejected yet hides how far it is
+        trial = nearer
     return trial
+
+
+def _find_step(trial: Trial[VisitT], before: Inputs) -> Score | None:
+    """Return what the state of the last cause of a trial does with the map as given, or with what was let go of it:
+    of either, what knows more of it; None if it changes what is used.
+    """
+    last, session = trial.taken[-1], trial.solution.session
+    held, known, found = held_by_map(session), last.suspect.sigma**-2, list[Score]()
+    for asked in (session,) if held is session else (held, session):
+        screen = Screen.of(optimum_of(asked))
+        direction = change_by(asked, screen, trial.inputs, last.suspect, given=before, state=last.state)
+        if direction is not None:
+            score = screen.score(direction, known, last.state)
+            found.append(score._replace(information=known + (score.information - known) * screen.optimum.worth))
+    return max(found, key=lambda score: score.information, default=None)
 
 
 def _with_last(trial: Trial[VisitT], last: Taken) -> Trial[VisitT]:

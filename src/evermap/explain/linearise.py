@@ -57,7 +57,14 @@ def held_by_map(session: AnySession) -> AnySession:
 
 
 def change_by(
-    session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect, share: float = STEP
+    session: AnySession,
+    screen: Screen,
+    inputs: Inputs,
+    suspect: Suspect,
+    share: float = STEP,
+    *,
+    given: Inputs | None = None,
+    state: float = 0.0,
 ) -> FloatArray | None:
     """Return (R,) by which residuals at the optimum change with the state of a cause; None if it changes what is used.
 
@@ -67,9 +74,11 @@ def change_by(
         inputs: of which it is the solution.
         suspect: a continuous cause.
         share: length of the step, as a share of its standard deviation beforehand.
+        given: inputs of which the cause was undone already, if it was: twice is not the sum for all causes.
+        state: at which it was.
     """
     step = share * suspect.sigma
-    moved = _residuals_under(session, screen, inputs, suspect, step)
+    moved = _residuals_under(session, screen, inputs, suspect, step, inputs if given is None else given, state)
     return None if moved is None else np.asarray((moved - screen.residual) / step)
 
 
@@ -88,7 +97,9 @@ def change_by_motion(session: AnySession, screen: Screen, inputs: Inputs, suspec
     """
     step = FINE_STEP * suspect.sigma
     as_estimated = _driven_as_estimated(session, inputs)
-    later, earlier = (_residuals_under(session, screen, as_estimated, suspect, way) for way in (step, -step))
+    later, earlier = (
+        _residuals_under(session, screen, as_estimated, suspect, way, as_estimated, 0.0) for way in (step, -step)
+    )
     return None if later is None or earlier is None else np.asarray((later - earlier) / (2.0 * step))
 
 
@@ -121,11 +132,11 @@ def _driven_as_estimated(session: AnySession, inputs: Inputs) -> Inputs:
 
 
 def _residuals_under(
-    session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect, step: float
+    session: AnySession, screen: Screen, inputs: Inputs, suspect: Suspect, step: float, given: Inputs, state: float
 ) -> FloatArray | None:
     """Return (R,) residuals at the optimum under a step of a cause; None if it changes what is used."""
     try:
-        undone = suspect.undo(inputs, step)
+        undone = suspect.undo(given, state + step)
         if isinstance(session, Solved):
             moved = _residuals_in_plane(session, screen.optimum, inputs, undone)
         else:

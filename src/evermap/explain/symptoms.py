@@ -523,7 +523,7 @@ OF_DETECTIONS = (
 """Names of noise levels of detections; all others are of the odometry."""
 
 
-def find_delay(result: SlamResult) -> ParameterEstimate | None:
+def find_odometry_delay(result: SlamResult) -> ParameterEstimate | None:
     """Return the delay of the odometry where it was estimated, as in the plane, and was not put right."""
     if any((cause.code, cause.subject) == ("clock", "sensor") for cause in result.causes):
         return None
@@ -535,7 +535,7 @@ def _shift_by_clock_m(result: SlamResult) -> float:
 
     Poses are those of the detections' clock: if the odometry's is right, they are off by as much.
     """
-    path, delay = result.trajectory, find_delay(result)
+    path, delay = result.trajectory, find_odometry_delay(result)
     if delay is None or len(path) < 3:
         return nan
     is_late = delay.value > max(LATE_S, SURELY * delay.sigma)

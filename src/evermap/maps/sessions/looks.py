@@ -33,7 +33,7 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 USUAL = LooksConfig()
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
-FEWEST_IN_SIGHT = 5
+FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight."""
 SHARES = np.geomspace(0.25, 64.0, 25)
 """Parameters of the beta distribution of that share which are weighed, all alike (both are a number of positions)."""
@@ -473,7 +473,7 @@ def misses_in_the_open(
     known = ~unseen & (x > 0)
     asked = unseen & (n > 0)
     p_missed = np.ones(count)
-    if np.count_nonzero(known) >= FEWEST_IN_SIGHT and asked.any():
+    if np.count_nonzero(known) >= FEWEST and asked.any():
         by_chance = _p_never_in_sight(x[known], n[known], n[asked])
         hidden = np.geomspace(settings.p_always_hidden, 0.99, 40)[:, None]
         missed = hidden + (1.0 - hidden) * by_chance  # (H, A) of what stands there

@@ -1,0 +1,96 @@
+"""The rules of the competition by themselves: who wins, who is tried, what must be explained, what a state costs."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from evermap.config import SlamConfig
+from evermap.explain import competition
+from evermap.explain.causes import Suspect
+from evermap.explain.competition import Taken, Trial
+
+
+def suspect(code: str = "tag-size", subject: str = "5", sigma: float = 0.3, p: float = 0.01) -> Suspect:
+    return Suspect(code, subject, p, lambda inputs, _: inputs, str, str, sigma, lambda state: state)
+
+
+def trial(evidence: float, *taken: Taken, noise: float = 1.0, worth: float = 1.0, result: object = None) -> Trial[Any]:
+    return Trial(cast("Any", None), cast("Any", SimpleNamespace(result=result)), taken, evidence, worth, noise)
+
+
+def test_a_solution_that_ignores_a_sensor_loses_to_one_that_hears_it() -> None:
+    deaf, hears = trial(1000.0, noise=12.0), trial(0.0, noise=2.0)
+    assert hears.beats(deaf) > 0.0 > deaf.beats(hears)
+    assert trial(1000.0, noise=8.0).beats(hears) > 0.0  # loud, but heard
+    assert deaf.beats(trial(0.0, noise=4.0)) > 0.0  # neither is as stated
+
+
+def test_what_is_not_new_counts_less_but_prices_count_whole() -> None:
+    one = Taken(suspect(p=0.01), 0.0)
+    price = one.suspect.log_p
+    assert price < 0.0
+    with_cause, without = trial(50.0 + price, one, worth=0.5), trial(0.0, worth=0.2)
+    assert with_cause.beats(without) == pytest.approx(0.2 * 50.0 + price)
+
+
+def test_two_of_a_kind_are_tried_and_none_twice() -> None:
+    ranked = [(9.0 - row, suspect(subject=str(row)), 0.1) for row in range(4)]
+    ranked += [(1.0, suspect("mount", "x"), 0.2), (0.5, suspect("clock", "camera"), 0.3)]
+    tried = {("tag-size", "1")}
+    found = competition._diverse(ranked, 3, tried)
+    assert [(one.code, one.subject) for one, _ in found] == [("tag-size", "0"), ("tag-size", "2"), ("mount", "x")]
+    assert ("mount", "x") in tried
+    assert ("clock", "camera") not in tried
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "changed", "rejected", "unexplained", "relieves"),
+    [
+        (("changes", "map"), ("changes",), (3, 3), (0.2, 0.2), (9.0, 9.0), True),
+        (("changes",), ("changes",), (3, 2), (0.2, 0.2), (9.0, 9.0), True),
+        (("changes",), ("changes",), (3, 3), (0.2, 0.1), (9.0, 9.0), True),
+        (("changes",), ("changes",), (3, 3), (0.2, 0.2), (9.0, 5.0), True),
+        (("changes",), ("changes",), (3, 3), (0.2, 0.15), (9.0, 8.0), False),
+        (
+            ("innovations",),
+            ("innovations",),
+            (3, 3),
+            (0.2, 0.2),
+            (9.0, 0.0),
+            False,
+        ),  # more was asked
+        (("changes", "map"), ("range_noise_factor",), (3, 0), (0.2, 0.0), (9.0, 0.0), False),  # all fits it
+        (("sigma_corner_px", "map"), ("sigma_corner_px",), (3, 3), (0.2, 0.2), (9.0, 9.0), True),
+    ],
+)
+def test_a_cause_must_explain_something_that_was_asked(
+    before: tuple[str, ...],
+    after: tuple[str, ...],
+    changed: tuple[int, int],
+    rejected: tuple[float, float],
+    unexplained: tuple[float, float],
+    relieves: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    best, now = trial(0.0, result=0), trial(1.0, result=1)
+    monkeypatch.setattr(competition, "find_symptoms", lambda result, *_: (before, after)[result])
+    monkeypatch.setattr(competition, "count_changed", lambda result: changed[result])
+    monkeypatch.setattr(competition, "share_rejected", lambda result: rejected[result])
+    monkeypatch.setattr(competition, "_find_score", lambda solution, _: unexplained[solution.result])
+    assert competition._relieves(now, best, SlamConfig()) is relieves
+
+
+def test_a_state_costs_how_unusual_it_is_and_how_well_it_is_known() -> None:
+    one = suspect(sigma=0.3)
+    unknown, usual = (competition._state_evidence(Taken(one, state)) for state in (0.6, 0.0))
+    assert usual == pytest.approx(one.log_p)
+    assert unknown == pytest.approx(one.log_p - 2.0)
+    known = competition._state_evidence(Taken(one, 0.6, 100.0 / 0.3**2))
+    assert known == pytest.approx(unknown - math.log(10.0))
+    before = trial(7.0, Taken(one, 0.6))
+    after = competition._with_last(before, Taken(one, 0.6, 100.0 / 0.3**2))
+    assert after.evidence == pytest.approx(7.0 - math.log(10.0))
