@@ -13,7 +13,7 @@ from evermap.existence.sites import Evidence, SiteLooks
 from evermap.maps.lives import Life, Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.sessions import decide
-from evermap.maps.sessions.believe import Believed
+from evermap.maps.sessions.believe import Believed, Witnessed
 from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.sensing.sightlines import nominal_lines
@@ -604,3 +604,32 @@ def test_of_old_stays_the_newest_are_kept() -> None:
     assert len(kept) == decide.USUAL.most_stays
     assert kept.last_s.min() == 7.0
     assert (np.diff(kept.first_s) > 0).all()
+
+
+@pytest.mark.parametrize("p", [0.2, 0.8])
+def test_one_in_the_place_of_another_is_one_change_or_none(p: float) -> None:
+    """Departure and arrival are told as one, if it is another one; the stay ended as probably as that."""
+    living = begun(found([1, 8, 9], [AT[1], (2.0, 0.1), AT[9]])).living
+    clique = living.members.clique_id
+    stays = Stays(
+        clique[[0, 1, 2]], living.sites.site_id[[0, 1, 2]], np.full(3, UNKNOWN), np.zeros((3, 2)), np.full(3, -np.inf),
+        np.zeros(3), np.array([50.0, 90.0, 50.0]), np.array([80.0, np.inf, 80.0]), np.array([0.99, 0.0, 0.9]),
+    )  # fmt: skip
+    living = replace(living, stays=stays)
+    nothing = (np.nan, np.nan)
+    told = tuple(
+        MapChange((name,), kind, 50.0, 80.0, nothing, 0.0, 0.9, hits, misses)
+        for name, kind, hits, misses in (
+            (1, ChangeKind.VANISHED, 0, 7), (8, ChangeKind.APPEARED, 5, 0), (9, ChangeKind.VANISHED, 0, 3),
+        )
+    )  # fmt: skip
+    none = np.array([np.nan])
+    what = Witnessed(np.array([1]), none, np.array([85.0]), np.array([p]), instead=np.array([8]))
+    after, changes = decide.with_replaced(living, told, what, begun(found([1, 8, 9], [AT[1], (2.0, 0.1), AT[9]])))
+    assert after.stays.p_gone.tolist() == [p, 0.0, 0.9]
+    assert changes[0] == told[2]
+    assert len(changes) == (1 if p < 0.5 else 2)
+    for one in changes[1:]:
+        assert (one.kind, one.landmark_ids, one.probability) == (ChangeKind.REPLACED, (1, 8), p)
+        assert (one.stamp_from_s, one.stamp_to_s, one.n_hits, one.n_misses) == (50.0, 85.0, 5, 7)
+        assert one.displacement_m == pytest.approx((2.0, 0.1))
