@@ -41,10 +41,17 @@ def errors() -> tuple[str, ...]:
     return ("--p-miss", str(P_ERROR), "--p-false", str(P_ERROR))
 
 
-def test_rates_of_a_cart_and_of_a_wall(table: Path, tmp_path: Path) -> None:
-    result = run("survival", "learn", table, "--recurrent", "two-state", *errors(), "--out", tmp_path / "m.json")
+@pytest.fixture(scope="module")
+def model(table: Path) -> Path:
+    """What is learned of both."""
+    path = table.parent / "m.json"
+    result = run("survival", "learn", table, "--recurrent", "two-state", *errors(), "--out", path)
     assert result.exit_code == 0, result.stderr
-    data = json.loads((tmp_path / "m.json").read_text())
+    return path
+
+
+def test_rates_of_a_cart_and_of_a_wall(model: Path) -> None:
+    data = json.loads(model.read_text())
     assert data["per"] == "class"
     cart, wall = data["models"]["vehicle"], data["models"]["wall"]
     rates = np.array(cart["rates_hz"])
@@ -56,9 +63,8 @@ def test_rates_of_a_cart_and_of_a_wall(table: Path, tmp_path: Path) -> None:
     assert np.array(wall["rates_hz"])[there, 1 - there] < 1e-4
 
 
-def test_persist_uses_the_model_of_each_class(table: Path, tmp_path: Path) -> None:
-    model, out = tmp_path / "m.json", tmp_path / "out"
-    assert run("survival", "learn", table, "--recurrent", "two-state", *errors(), "--out", model).exit_code == 0
+def test_persist_uses_the_model_of_each_class(table: Path, model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
     result = run("persist", table, "--model", model, *errors(), "--out", out, "--figures", "0")
     assert result.exit_code == 0, result.stderr
     rows = np.genfromtxt(table, delimiter=",", names=True, dtype=None, encoding="utf-8")
@@ -102,9 +108,7 @@ def test_wrong_choices_are_one_line_and_write_nothing(
     assert not (tmp_path / "m.json").exists()
 
 
-def test_a_model_that_lacks_a_feature_says_which(table: Path, tmp_path: Path) -> None:
-    model = tmp_path / "m.json"
-    assert run("survival", "learn", table, "--recurrent", "two-state", "--out", model).exit_code == 0
+def test_a_model_that_lacks_a_feature_says_which(model: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.csv"
     other.write_text("stamp_s,feature_id,class_id,detected\n0,tree,plant,1\n1,tree,plant,1\n")
     result = run("persist", other, "--model", model, "--out", tmp_path / "out")

@@ -346,7 +346,7 @@ def test_a_cause_is_refined_until_it_leaves_nothing_to_changes(
     world: World, name: tuple[str, str], state: float, true: float, within: float
 ) -> None:
     inputs = Inputs.of(*recorded(world, "corners"))
-    suspect = next(one for one in list_suspects(inputs, discrete=False) if (one.code, one.subject) == name)
+    suspect = next(one for one in list_suspects(inputs) if (one.code, one.subject) == name)
     trial, solve_under = trial_under(inputs, suspect, state)
     assert trial.solution.result.changes != ()
     budget = competition._Budget(6)
@@ -359,7 +359,7 @@ def test_a_cause_is_refined_until_it_leaves_nothing_to_changes(
 def test_a_state_of_a_lens_that_was_undone_changes_residuals_smoothly() -> None:
     """It is set, not added: a step from what was undone already would go back to no distortion at all."""
     inputs = Inputs.of(*recorded(World(seed=8, bent=-0.2), "corners"))
-    suspect = next(one for one in list_suspects(inputs, discrete=False) if one.code == "distortion")
+    suspect = next(one for one in list_suspects(inputs) if one.code == "distortion")
     trial, _ = trial_under(inputs, suspect, -0.2)
     solved, screen = trial.solution.session, Screen.of(optimum_of(trial.solution.session))
     coarse, fine = (

@@ -18,7 +18,7 @@ from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.solve import solve_space
-from evermap.types import Frames, Landmarks, SlamResult, SpatialSensor, rows_of
+from evermap.types import ChangeKind, Frames, Landmarks, SlamResult, SpatialSensor, rows_of
 
 from .corridors import World, as_directions, tagged_corridor
 from .halls import hall
@@ -244,7 +244,11 @@ def test_two_tags_that_were_carried_away_together_do_not_carry_the_robot_away(se
     result = run_slam(recording, prior_map=moved(world.tags, {5: (0.0, 9.0, 0.0), 6: (0.0, 9.0, 0.0)}))
     gap = np.linalg.norm(result.trajectory.pose_world_robot[:, :3] - _true_at(world, result), axis=1)
     assert np.max(gap) < 0.1
-    assert {tag for change in result.changes for tag in change.landmark_ids} <= {5, 6}
+    told = {kind: set[int]() for kind in ChangeKind}
+    for change in result.changes:
+        told[change.kind] |= set(change.landmark_ids)
+    assert told.pop(ChangeKind.VANISHED) <= {4, 7}
+    assert set().union(*told.values()) <= {5, 6}
 
 
 def _true_at(world: World, result: SlamResult) -> np.ndarray:
