@@ -9,7 +9,7 @@ import pytest
 
 from evermap import run_slam
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.types import ChangeKind, Recording, SlamResult
+from evermap.types import ChangeKind, Landmarks, Recording, SlamResult
 
 from .worlds import World
 
@@ -78,3 +78,12 @@ def test_where_much_of_a_map_was_not_seen_it_is_not_all_gone() -> None:
     result = run_slam(replace(recording, detections=recording.detections[there]), prior_map=world.map_in_plane())
     assert not result.gone.landmark_id.size
     assert ChangeKind.VANISHED not in {change.kind for change in result.changes}
+
+
+def test_what_is_missed_from_few_positions_says_nothing() -> None:
+    """A landmark that comes into view at one place of the drive may be hidden from there."""
+    world = World(seed=8, seconds=60.0)
+    recording, survey = world.plane(), world.map_in_plane()
+    far = Landmarks.at([99], [[14.6, 4.0]])  # beyond a wall, in nominal view from the end of the field
+    result = run_slam(recording, prior_map=survey.joined(far))
+    assert not result.gone.landmark_id.size

@@ -34,7 +34,8 @@ USUAL = LooksConfig()
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
 FEWEST = 5
-"""Places that were seen, from which it is learned from how much of where they are in view places are in sight."""
+"""Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
+positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
 SHARES = np.geomspace(0.25, 64.0, 25)
 """Parameters of the beta distribution of that share which are weighed, all alike (both are a number of positions)."""
 USUAL_RANGE = 0.9
@@ -471,7 +472,7 @@ def misses_in_the_open(
     of = cells[:, 0][looked := (expected >= EXPECTED) | hit]
     n, x = np.bincount(of, minlength=count), np.bincount(of, hit[looked], minlength=count)
     known = ~unseen & (x > 0)
-    asked = unseen & (n > 0)
+    asked = unseen & (n >= FEWEST)
     p_missed = np.ones(count)
     if np.count_nonzero(known) >= FEWEST and asked.any():
         by_chance = _p_never_in_sight(x[known], n[known], n[asked])
