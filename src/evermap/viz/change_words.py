@@ -30,10 +30,11 @@ def explanations(result: SlamResult) -> list[str]:
 
 def near_alternatives(result: SlamResult) -> tuple[Alternative, ...]:
     """Return alternatives within `NATS` of the best explanation, which has at most the probability of each of its
-    changes.
+    changes, but for what vanished: that is believed apart.
     """
     rest = 1.0 - sum(alternative.probability for alternative in result.alternatives)
-    best = min((change.probability for change in result.changes), default=rest)
+    own = (change.probability for change in result.changes if change.kind is not ChangeKind.VANISHED)
+    best = min(own, default=rest)
     return tuple(other for other in result.alternatives if other.probability >= math.exp(-NATS) * best)
 
 

@@ -108,7 +108,7 @@ def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation
     figure = new_figure(7.2, height_in)
     panels = lay_out(figure, low, high, up=scene.up)
     (moved, *_) = [_draw_panel(axes, view, scene, low, high) for axes, view in panels]
-    columns = 4 if len(panels) == 1 else 3
+    columns = 4 if len(panels) == 1 and not len(scene.gone) else 3  # its label is long
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=columns)
     if moved:
         of_changes = 1 if len(changed) <= _MOST_LINES else 3
