@@ -307,6 +307,11 @@ class Sensor:
     sigma_odometer_scale: float | None = None
     sigma_askew_rad: float | None = None
 
+    @property
+    def states_scale(self) -> bool:
+        """Whether its kind or data sheet says how well ranges or odometer measure lengths: else ranges do as stated."""
+        return self.kind is not None or self.sigma_scale is not None or self.sigma_odometer_scale is not None
+
 
 @dataclass(frozen=True, slots=True)
 class RobotSightings(_Columns):

@@ -15,7 +15,7 @@ from evermap.types import Recording, SlamResult
 from .worlds import World
 
 
-def recorded(late_s: float, *, is_measured: bool = True) -> Recording:
+def record(late_s: float, *, is_measured: bool = True) -> Recording:
     """A robot that turns and changes its speed, and a sensor that stamps its frames late."""
     recording = World(seed=3, late_s=late_s).plane()
     return replace(recording, odometry=replace(recording.odometry, is_measured=is_measured))
@@ -30,7 +30,7 @@ def error_m(result: SlamResult, recording: Recording) -> float:
 
 @pytest.mark.parametrize("late_s", [0.05, 0.2])
 def test_poses_are_where_the_robot_was_though_the_sensor_is_late(late_s: float) -> None:
-    right, late = recorded(0.0), recorded(late_s)
+    right, late = record(0.0), record(late_s)
     result = run_slam(late)
     assert error_m(result, late) < 1.5 * error_m(run_slam(right), right) + 0.002
     (cause,) = result.causes
@@ -47,14 +47,14 @@ def test_poses_are_where_the_robot_was_though_the_sensor_is_late(late_s: float) 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.01])
 def test_a_clock_that_is_right_is_left_as_it_is(late_s: float) -> None:
-    result = run_slam(recorded(late_s))
+    result = run_slam(record(late_s))
     assert not result.causes
-    assert result.trajectory.stamp_s[0] == recorded(late_s).frames.stamp_s[0]
+    assert result.trajectory.stamp_s[0] == record(late_s).frames.stamp_s[0]
 
 
 def test_velocities_may_be_commands_which_are_early() -> None:
     """As on recordings whose robots follow their commands late: poses are at the stamps of what was seen."""
-    commanded = recorded(0.2, is_measured=False)
+    commanded = record(0.2, is_measured=False)
     result = run_slam(commanded)
     assert error_m(result, commanded) > 0.05  # here the sensor is late after all: nothing says so
     assert [(one.code, one.subject) for one in result.causes] == [("clock", "odometry")]
@@ -62,7 +62,7 @@ def test_velocities_may_be_commands_which_are_early() -> None:
 
 
 def test_an_odometry_that_is_late_is_no_sensor_that_is_early() -> None:
-    recording = recorded(-0.12)
+    recording = record(-0.12)
     result = run_slam(recording)
     assert [(one.code, one.subject) for one in result.causes] == [("clock", "odometry")]
     assert result.trajectory.stamp_s[0] == recording.frames.stamp_s[0]
@@ -70,7 +70,7 @@ def test_an_odometry_that_is_late_is_no_sensor_that_is_early() -> None:
 
 def test_clocks_that_differ_are_no_jump_while_nothing_is_seen() -> None:
     """A robot that stands, and drives off between two frames that saw something: the clock says when."""
-    seen = run_slam(recorded(0.2, is_measured=False))
+    seen = run_slam(record(0.2, is_measured=False))
     path, count = seen.trajectory, 12
     step = np.arange(count)
     x_m = np.where(step < 6, 0.0, step - 5.62)  # two metres a second, from 0.2 s before the sixth pose on

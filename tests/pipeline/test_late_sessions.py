@@ -177,7 +177,7 @@ ANYHOW = tuple(permutations(range(3)))
 
 
 @cache
-def told_in(order: tuple[int, ...]) -> dict[tuple[str, float], list[str]]:
+def tell_in(order: tuple[int, ...]) -> dict[tuple[str, float], list[str]]:
     """What each session of a map tells, and what changed since each of its revisions, by the instant of these; sessions
     of two robots, which came in this order and one of them twice.
     """
@@ -204,7 +204,7 @@ def spoken(change: MapChange) -> str:
 @pytest.mark.parametrize("order", ANYHOW[1:], ids=str)
 def test_the_story_does_not_depend_on_who_tells_it_first(order: tuple[int, ...]) -> None:
     """Of all sessions, and between any two instants, changes and probabilities are the same to 1e-6."""
-    wanted, found = told_in(ANYHOW[0]), told_in(order)
+    wanted, found = tell_in(ANYHOW[0]), tell_in(order)
     assert found == {span: wanted[span] for span in found}
     assert len([span for span in found if span[0] == "told by"]) == 3
     assert sum(map(len, found.values())) > 5

@@ -221,7 +221,7 @@ class Graph(Generic[State]):
         cost += 0.5 * float(offset @ (self.border.information * offset))
         return Linear(values, tuple(weights), cost, -self.border.information * offset)
 
-    def relinearised(self, now: Linear, state: State, blocks: Mapping[int, FactorBlock[State]]) -> Linear:
+    def relinearise_blocks(self, now: Linear, state: State, blocks: Mapping[int, FactorBlock[State]]) -> Linear:
         """Return the graph with other blocks in place of some of its own, linearised at the values where it is already.
 
         Args:

@@ -79,8 +79,6 @@ AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 ODOMETRY_OFF = 0.3
 """Share of the motion by which odometry is off from which it is asked why, as by the verdict."""
-LENGTHS = ("odometry_forward_scale", "odometry_scale")
-"""Calibration states that say how long a drive is by its odometry, in the plane and in space."""
 LENGTH_OFF, ODOMETRY_NOISY = 0.13, 2.5
 """Logarithm of the length of the trajectory over that of the odometry, and its noise over what is usual, from which the
 same is asked: a run that is sound has less."""
@@ -164,7 +162,7 @@ class Trial(Generic[VisitT]):
         return (self.evidence - other.evidence - price) * min(self.worth, other.worth) + price
 
     @cached_property
-    def unexplained(self) -> float:
+    def gain_left(self) -> float:
         """What the calibration that earns most would gain yet, of those that move the poses [nats]."""
         return _find_score(self.solution, self.inputs)
 
@@ -328,7 +326,7 @@ def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
     delay = find_odometry_delay(result)
     if delay is None or not (delay.p_needed > SURE and -delay.value > max(LEAST_LATE_S, SURELY * delay.sigma)):
         return None
-    suspect = next(one for one in list_suspects(inputs) if one.code == CLOCK)
+    suspect = next(one for one in list_suspects(inputs, calibrations=True) if one.code == CLOCK)
     return Taken(suspect, -delay.value, delay.sigma**-2)
 
 
@@ -336,8 +334,8 @@ def _with_late_sensor(explained: Explained[VisitT], late: Taken, result: SlamRes
     """Return what explains a session at its true stamps, with how late those that were given are: by what was taken off
     them, and by what `result` has left of it.
     """
-    left = next((one for one in result.parameters if one.name == "odometry_delay_s"), None)
-    suspect, state = late.suspect, late.state - (0.0 if left is None or left.fixed else left.value)
+    left = find_odometry_delay(result)
+    suspect, state = late.suspect, late.state - (0.0 if left is None else left.value)
     cause = Cause(
         suspect.code, suspect.subject, suspect.say(state), state, late.information**-0.5, 1.0, suspect.fix(state)
     )
@@ -402,7 +400,8 @@ def _is_far_off(state: ParameterEstimate, farthest: float) -> bool:
     if state.fixed or (state.shown_with and state.evident) or not state.p_needed > SURE:
         return False
     off = abs(state.value - state.prior_mean)
-    if state.name in LENGTHS and abs(math.log(max(_ratio_of(state), 1e-9))) > LENGTH_OFF:
+    of_length = any(state.name == name for name, _ in OWN_STATES["odometry-scale"])
+    if of_length and abs(math.log(max(_ratio_of(state), 1e-9))) > LENGTH_OFF:
         return off > SURELY * state.sigma  # the run is told not to be sound for it
     return off > farthest * max(state.prior_sigma, state.sigma)
 
@@ -422,7 +421,7 @@ def _find_delays(result: SlamResult, late_s: float) -> tuple[Cause, ...]:
         table = "odometry.csv" if name == "odometry" else f"detections.csv of {name}"
         how = f"stamps of {name} are {abs(state.value):.3g} s {'late' if state.value > 0.0 else 'early'}"
         fix = f"{table}: stamp_s {'-' if state.value > 0.0 else '+'} {abs(state.value):.3g}"
-        found.append(Cause("clock", name, how, state.value, state.sigma, min(state.p_needed, 1.0), fix))
+        found.append(Cause(CLOCK, name, how, state.value, state.sigma, min(state.p_needed, 1.0), fix))
     return tuple(found)
 
 
@@ -479,10 +478,7 @@ def _is_metre_known(inputs: Inputs) -> bool:
     differ by: that it is the ranges which are off explains as much, and would move all poses.
     """
     recording = inputs.recording
-    if is_in_space(recording) or inputs.prior_map is not None:
-        return True
-    sensor = recording.sensor
-    return sensor.kind is not None or sensor.sigma_scale is not None or sensor.sigma_odometer_scale is not None
+    return is_in_space(recording) or inputs.prior_map is not None or recording.sensor.states_scale
 
 
 def share_rejected(result: SlamResult) -> float:
@@ -510,7 +506,7 @@ def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> 
         return True
     if not {*before, *after} <= {CHANGES}:
         return False
-    return trial.unexplained < FEWER * best.unexplained
+    return trial.gain_left < FEWER * best.gain_left
 
 
 def _solve_alone(
@@ -690,7 +686,7 @@ def _screen_pairs(
     loss, found = find_pair_loss(before, rules), list[tuple[float, Suspect, float]]()
     least = max(rules.gain, FALLS * loss)
     for suspect in suspects:
-        if suspect.code == "clock":
+        if suspect.code == CLOCK:
             state = find_delay(before, rules)
             gain = loss - find_pair_loss(before, rules, late_by(state))
             found += [(gain, suspect, state)] if gain > least and abs(state) > FAR * suspect.sigma else []

@@ -136,7 +136,7 @@ def find_unseen_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[floa
     shift_m, turn_rad = _differ(*poses, first, last)
     went_m = np.min([np.linalg.norm(find_motions(each, first, last), axis=1) for each in poses], axis=0)
     # more than the robot went at all, and goes until the later clock says so: clocks that differ are no jump
-    went_m += _longest_delay_s(result.parameters) * _find_top_speed(path)
+    went_m += _find_longest_delay_s(result.parameters) * _find_top_speed(path)
     beyond = shift_m > np.maximum(np.maximum(JUMP_M, went_m), TIMES * usual_m * (last - first))
     rows = np.flatnonzero(beyond)
     rows = rows[np.argsort(-shift_m[rows])]
@@ -144,7 +144,7 @@ def find_unseen_jumps(result: SlamResult, gaps_s: FloatArray) -> list[tuple[floa
     return list(zip(*(each.tolist() for each in found), strict=True))
 
 
-def _longest_delay_s(parameters: tuple[ParameterEstimate, ...]) -> float:
+def _find_longest_delay_s(parameters: tuple[ParameterEstimate, ...]) -> float:
     """Return by how much two clocks differ at most, as was estimated."""
     return max((abs(one.value) for one in parameters if one.name.endswith("_delay_s") and not one.fixed), default=0.0)
 

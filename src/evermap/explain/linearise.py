@@ -169,7 +169,7 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
         del blocks[ODOMETRY]
     if all(np.array_equal(getattr(moved, of), getattr(problem, of), equal_nan=True) for of in SEEN):
         del blocks[DETECTIONS]
-    return residuals_of(optimum.graph, optimum.graph.relinearised(optimum.now, optimum.state, blocks))[0]
+    return residuals_of(optimum.graph, optimum.graph.relinearise_blocks(optimum.now, optimum.state, blocks))[0]
 
 
 def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -45,7 +46,7 @@ _LARGEST_ID = 2**53
 
 
 @dataclass(frozen=True, slots=True)
-class NamedColumns:
+class NamedColumns(ABC):
     """Columns of a file by name, however their cells are held.
 
     Attributes:
@@ -95,9 +96,9 @@ class NamedColumns:
                 raise self.error("missing column", row=None, field=name, hint=hint)
         return self.has_any(names)
 
+    @abstractmethod
     def numbers(self, quantity: Quantity) -> FloatArray:
         """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
-        raise NotImplementedError
 
     def filled(self, quantity: Quantity, default: float) -> FloatArray:
         """Return an optional column (R,), with what an empty cell, or no such column, means."""

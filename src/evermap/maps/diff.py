@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import takewhile
+from itertools import chain, takewhile
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.living import TURNS, LivingMap, Members
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.history import STORY, Chapter, read_story
-from evermap.maps.store.protocol import DamagedMapError, MapStore, Revision, RevisionKind
+from evermap.maps.store.protocol import Attachment, DamagedMapError, MapStore, Revision, RevisionKind
 from evermap.show import Shown, data_frame
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, MapChange
 
@@ -110,7 +110,7 @@ def diff(store: MapStore, a: int, b: int | None = None) -> Difference:
     b = store.head() if b is None else b
     before, after = store.load(a), store.load(b)
     names = after.landmark_names | before.landmark_names
-    told, new = told_between(store, a, b)
+    told, new = collect_changes(store, a, b)
     changes = tuple(change.named(names) for change in net(told, before, after, new=new))
     more = grown(before.members.landmark_id, after, changes)
     return Difference(a, b, changes, more, edits(before.members, after.members))
@@ -122,12 +122,26 @@ def story_of(store: MapStore, revision: int | None = None) -> tuple[Chapter, ...
     Raises:
         DamagedMapError: a part is not what was written.
     """
-    line = store.lineage(revision)
-    late = {item.revision: item for item in store.attachments(line) if item.name == STORY}
+    return _read_stories(store, [store.lineage(revision)])[0]
+
+
+def _read_stories(store: MapStore, lines: Sequence[Sequence[int]]) -> list[tuple[Chapter, ...]]:
+    """Return the stories of some lines of revisions, of all of which the log is read once."""
+    late = {item.revision: item for item in store.attachments(sorted({*chain(*lines)})) if item.name == STORY}
     log = {item.number: item for item in store.log()}
     told: dict[int, list[MapChange]] = {}
     for number, change in store.changes_of():
         told.setdefault(number, []).append(change)
+    return [_read_story(store, line, late, log, told) for line in lines]
+
+
+def _read_story(
+    store: MapStore,
+    line: Sequence[int],
+    late: Mapping[int, Attachment],
+    log: Mapping[int, Revision],
+    told: Mapping[int, Sequence[MapChange]],
+) -> tuple[Chapter, ...]:
     chapters: list[Chapter] = []
     for number in line:
         if number in late:
@@ -161,14 +175,14 @@ def read_log(store: MapStore) -> tuple[Revision, ...]:
     )
 
 
-def told_between(store: MapStore, a: int, b: int) -> tuple[list[ToldBySession], frozenset[int] | None]:
+def collect_changes(store: MapStore, a: int, b: int) -> tuple[list[ToldBySession], frozenset[int] | None]:
     """Return the changes between two revisions, and the landmarks that are new since the first, None where these are
     all that it does not know.
 
     Of two revisions of which one has all sessions of the other that one tells, between their instants. Where each has
     its own, those of `a` are undone back to what they have in common.
     """
-    old, new = story_of(store, a), story_of(store, b)
+    old, new = _read_stories(store, [store.lineage(a), store.lineage(b)])
     had, has = ({one.revision for one in story} for story in (old, new))
     if had <= has:
         since = _after(new, had)

@@ -144,11 +144,10 @@ class CalibrationPrior:
         sigma[BEARING] = np.hypot(sigma[BEARING], askew)
         known = sensor.kind not in (None, SensorKind.LASER)
         p_needed = self.settings.p_needed_known if known else self.settings.p_needed_sensor
-        scale_as_stated = sensor.kind is None and sheet[SLOPE] is None and sheet[FORWARD] is None
         return replace(
             self,
             sigma=sigma,
-            slope_share=0.0 if scale_as_stated else None,
+            slope_share=None if sensor.states_scale else 0.0,
             angle_share=angle_share,
             askew_sigma=askew,
             p_sensor=p_needed,

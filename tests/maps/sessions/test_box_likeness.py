@@ -19,7 +19,7 @@ USUAL = BoxLikeness.usual(SETTINGS)
 SAME_M, OTHER_M = np.array(SETTINGS.sigma_size_m), np.array(SETTINGS.sigma_class_m)
 
 
-def paired(away_m: FloatArray, size_m: FloatArray, p: float = 0.9, turn_rad: float = 0.0) -> BoxPairs:
+def pair_boxes(away_m: FloatArray, size_m: FloatArray, p: float = 0.9, turn_rad: float = 0.0) -> BoxPairs:
     """Pairs (N, 1), side by side along x by `away_m` (N,), with differences of sizes (N, 3)."""
     n = len(away_m)
     off_m = np.column_stack([away_m, np.zeros(n)])[:, None]
@@ -32,7 +32,7 @@ def odds(pairs: BoxPairs, likeness: BoxLikeness = USUAL) -> float:
     return float(likeness.log_odds(pairs)[0, 0])
 
 
-ONE = paired(np.array([0.1]), np.zeros((1, 3)))
+ONE = pair_boxes(np.array([0.1]), np.zeros((1, 3)))
 
 
 def test_sizes_are_compared_as_those_of_one_box_and_of_two() -> None:
@@ -40,9 +40,9 @@ def test_sizes_are_compared_as_those_of_one_box_and_of_two() -> None:
     size_m = np.array([[0.1, 0.05, -0.02]])
     ratio = float(np.prod(stats.norm.pdf(size_m[0], 0.0, SAME_M) / stats.norm.pdf(size_m[0], 0.0, OTHER_M)))
     expected = math.log((1.0 - SETTINGS.odd_share) * ratio + SETTINGS.odd_share)
-    assert USUAL.size_nats(paired(np.zeros(1), size_m))[0, 0] == pytest.approx(expected)
-    assert odds(paired(np.array([0.1]), 8.0 * SAME_M[None])) < odds(ONE) - 1.0
-    unknown = paired(np.zeros(1), np.full((1, 3), np.nan))
+    assert USUAL.size_nats(pair_boxes(np.zeros(1), size_m))[0, 0] == pytest.approx(expected)
+    assert odds(pair_boxes(np.array([0.1]), 8.0 * SAME_M[None])) < odds(ONE) - 1.0
+    unknown = pair_boxes(np.zeros(1), np.full((1, 3), np.nan))
     assert USUAL.size_nats(unknown)[0, 0] == pytest.approx(0.0)
 
 
@@ -66,7 +66,7 @@ def test_hazards_that_are_faster_end_more_stays() -> None:
 
 def test_a_place_that_is_often_taken_again_speaks_for_another_box() -> None:
     assert odds(ONE, replace(USUAL, p_taken=0.9)) < odds(ONE, replace(USUAL, p_taken=0.1)) - 1.0
-    assert odds(paired(np.array([1.0]), np.zeros((1, 3)))) < odds(ONE) - 2.0
+    assert odds(pair_boxes(np.array([1.0]), np.zeros((1, 3)))) < odds(ONE) - 2.0
     assert odds(replace(ONE, turn_rad=np.full((1, 1), 1.0))) < odds(ONE) - 0.5
 
 
@@ -107,7 +107,7 @@ def test_spreads_of_sizes_are_learned_from_both_kinds_of_pairs() -> None:
     n_same, n_other = 90, 30
     size_m = np.vstack([rng.normal(0.0, SAME_M / 3.0, (n_same, 3)), rng.normal(0.0, OTHER_M, (n_other, 3))])
     away_m = np.abs(np.append(rng.normal(0.0, 0.1, n_same), rng.normal(0.0, 0.5, n_other)))
-    pairs = paired(away_m, size_m, p=0.8)
+    pairs = pair_boxes(away_m, size_m, p=0.8)
     found = box_likeness._maximise(USUAL, pairs, USUAL)
     np.testing.assert_allclose(found.same_size_m, SAME_M / 3.0, rtol=0.25)
     p_same = 1.0 / (1.0 + np.exp(-found.log_odds(pairs)[:, 0]))

@@ -396,14 +396,11 @@ def _empty_looks(
     return views.frames[near][good], rate[good], views.stamp_s[near][good]
 
 
-def flanked_misses(
+def weigh_misses(
     watch: Watch, floor_m: FloatArray, unseen: BoolArray, oriented: BoolArray, settings: LooksConfig = USUAL
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which looks at places that were never detected lie between detections of others, and (P,) how probable all
-    these misses are if something stands there.
-
-    A look between what is seen on both sides of it from nearby, at no less than a share of its range, is blocked by
-    something narrow only. From several positions that is improbable, unless the place is hidden from all.
+    """Return which looks at places that were never detected count as misses, and (P,) how probable all of them are if
+    something stands there: between detections of others, or in the open, whichever says more of a place.
 
     Args:
         watch: looks of a session.
@@ -412,12 +409,31 @@ def flanked_misses(
         oriented: (P,) whether the looks know to where it faces.
         settings: what counts.
     """
+    listed = watch.listed
+    range_m = np.linalg.norm(floor_m[listed.landmark] - watch.eye[listed.pose, :2], axis=1)
+    near = range_m <= (np.quantile(range_m[listed.hit], USUAL_RANGE) if listed.hit.any() else 0.0)
+    flanked, p_flanked = _misses_between_others(watch, floor_m, unseen, oriented, near, settings)
+    in_the_open, p_open = _misses_in_the_open(watch, len(floor_m), unseen, near, settings)
+    flanked |= in_the_open & (p_open < p_flanked)[listed.landmark]
+    return flanked, np.minimum(p_flanked, p_open)
+
+
+def _misses_between_others(
+    watch: Watch, floor_m: FloatArray, unseen: BoolArray, oriented: BoolArray, near: BoolArray, settings: LooksConfig
+) -> tuple[BoolArray, FloatArray]:
+    """Return which looks at places that were never detected lie between detections of others, and (P,) how probable all
+    these misses are if something stands there.
+
+    A look between what is seen on both sides of it from nearby, at no less than a share of its range, is blocked by
+    something narrow only. From several positions that is improbable, unless the place is hidden from all.
+
+    Looks that count are `near`, (N,).
+    """
     listed, eye = watch.listed, watch.eye
     away = floor_m[listed.landmark] - eye[listed.pose, :2]
     range_m, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     flanked = np.zeros(len(listed.pose), dtype=np.bool_)
-    reach_m = float(np.quantile(range_m[listed.hit], USUAL_RANGE)) if listed.hit.any() else 0.0
-    asked = np.flatnonzero(unseen[listed.landmark] & (range_m <= reach_m))
+    asked = np.flatnonzero(unseen[listed.landmark] & near)
     half = np.floor(2.0 * eye[:, :2] / settings.elsewhere_m).astype(np.int64)
     hits = np.unique(np.column_stack([half[listed.pose[listed.hit]], listed.landmark[listed.hit]]), axis=0)
     for cell in np.unique(half[listed.pose[asked]], axis=0):
@@ -425,8 +441,8 @@ def flanked_misses(
         seen = np.unique(hits[(np.abs(hits[:, :2] - cell) <= 1).all(axis=1), 2])
         ahead = floor_m[seen][None] - eye[listed.pose[looks], :2][:, None]
         turn = se2.wrap(np.arctan2(ahead[..., 1], ahead[..., 0]) - bearing[looks][:, None])
-        near = np.hypot(ahead[..., 0], ahead[..., 1]) < settings.flank_share * range_m[looks][:, None]
-        beside = ~near & (np.abs(turn) < settings.flank_rad)
+        in_front = np.hypot(ahead[..., 0], ahead[..., 1]) < settings.flank_share * range_m[looks][:, None]
+        beside = ~in_front & (np.abs(turn) < settings.flank_rad)
         flanked[looks] = (beside & (turn > 0.0)).any(axis=1) & (beside & (turn < 0.0)).any(axis=1)
     p_missed = np.ones(len(floor_m))
     for place in np.unique(listed.landmark[flanked]).tolist():
@@ -444,8 +460,8 @@ def flanked_misses(
     return flanked, p_missed
 
 
-def misses_in_the_open(
-    watch: Watch, floor_m: FloatArray, unseen: BoolArray, settings: LooksConfig = USUAL
+def _misses_in_the_open(
+    watch: Watch, count: int, unseen: BoolArray, near: BoolArray, settings: LooksConfig
 ) -> tuple[BoolArray, FloatArray]:
     """Return which looks at places that were never detected count, and (P,) how probable all these misses are if
     something stands there that is in sight from as many positions as what was seen.
@@ -455,16 +471,9 @@ def misses_in_the_open(
     zero). Besides, some places are in sight from nowhere, behind walls or in rooms that were not entered. How many is
     learned, too: where much of a map was not seen, it is not all gone. What a place itself says does not count for it.
 
-    Args:
-        watch: looks of a session.
-        floor_m: (P, 2) places.
-        unseen: (P,) whether a place was never detected.
-        settings: what counts.
+    Looks that count are `near`, (N,), at `count` places.
     """
-    every, count = watch.listed, len(floor_m)
-    range_m = np.linalg.norm(floor_m[every.landmark] - watch.eye[every.pose, :2], axis=1)
-    near = range_m <= (np.quantile(range_m[every.hit], USUAL_RANGE) if every.hit.any() else 0.0)
-    listed = every.rows(near)
+    listed = watch.listed.rows(near)
     position = np.floor(watch.eye[listed.pose, :2] / settings.elsewhere_m).astype(np.int64)
     cells, cell = np.unique(np.column_stack([listed.landmark, position]), axis=0, return_inverse=True)
     expected = np.bincount(cell.ravel(), listed.p_detect, minlength=len(cells))
@@ -483,7 +492,7 @@ def misses_in_the_open(
         fit = rest + np.count_nonzero(known) * np.log1p(-hidden) - 0.5 * np.log(hidden)
         weight = np.exp(fit - fit.max(axis=0))
         p_missed[asked] = (weight * missed).sum(axis=0) / weight.sum(axis=0)
-    return near & asked[every.landmark], np.maximum(p_missed, settings.p_always_hidden)
+    return near & asked[watch.listed.landmark], np.maximum(p_missed, settings.p_always_hidden)
 
 
 def _p_never_in_sight(seen: IntArray, of_seen: IntArray, positions: IntArray) -> FloatArray:

@@ -26,9 +26,8 @@ from evermap.maps.sessions.looks import (
     Sighting,
     Watch,
     arrivals,
-    flanked_misses,
     looked_at,
-    misses_in_the_open,
+    weigh_misses,
 )
 from evermap.maps.sessions.placing import ANYWAY, Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
@@ -562,16 +561,13 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     names, floor_m = living.places.landmark_id, np.ascontiguousarray(living.places.position_m[:, :2])
     asked = np.isin(names, unseen.landmark_id)
     oriented = np.zeros(len(names), dtype=np.bool_) if rotation is None else np.isfinite(living.places.rotation[:, 0])
-    flanked, p_missed = flanked_misses(watch, floor_m, asked, oriented, config.looks)
-    in_the_open, p_open = misses_in_the_open(watch, floor_m, asked, config.looks)
-    flanked |= in_the_open & (p_open < p_missed)[watch.listed.landmark]
-    p_missed = np.minimum(p_missed, p_open)
+    counts, p_missed = weigh_misses(watch, floor_m, asked, oriented, config.looks)
     row = np.searchsorted(names, unseen.landmark_id)  # one place each, in the order of their names
     p_gone = config.looks.p_gone
     p_exists = p_missed[row] * (1.0 - p_gone) / (p_missed[row] * (1.0 - p_gone) + p_gone)
-    pose, which = watch.listed.pose[flanked], watch.listed.landmark[flanked]
+    pose, which = watch.listed.pose[counts], watch.listed.landmark[counts]
     frame = np.searchsorted(visit.recording.frames.stamp_s, watch.stamp_s[pose])
-    every = slam.misses.joined(Misses(frame.astype(np.int64), names[which], watch.listed.p_detect[flanked]))
+    every = slam.misses.joined(Misses(frame.astype(np.int64), names[which], watch.listed.p_detect[counts]))
     every = rows_of(every, np.lexsort((every.landmark_id, every.frame)))
     unseen = replace(unseen, p_exists=p_exists, n_misses=np.bincount(which, minlength=len(names))[row])
     gone = replace(unseen[p_exists < EXISTS], frame=found.frame)
@@ -579,12 +575,13 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
         return replace(slam, misses=every)
     nowhere = (math.nan,) * given.position_m.shape[1]
     told = tuple(
-        MapChange((identity,), ChangeKind.VANISHED, math.nan, visit.span_s[0], nowhere, 0.0, 1.0 - p, 0, misses)
+        MapChange((identity,), ChangeKind.VANISHED, math.nan, visit.span_s[0], nowhere, 0.0, 1.0 - p, 0, misses).named(
+            given.names
+        )
         for identity, p, misses in zip(
             gone.landmark_id.tolist(), gone.p_exists.tolist(), gone.n_misses.tolist(), strict=True
         )
     )
-    told = tuple(one.named(given.names) for one in told)
     return replace(slam, misses=every, gone=gone, changes=(*slam.changes, *told))
 
 
