@@ -14,10 +14,10 @@ from evermap.interrupts import watched
 from evermap.slam.batch import Batch, Outcome, SolvedPart
 from evermap.slam.calibration import DELAY, CalibrationPrior
 from evermap.slam.changes.joint import Joint, may_search
-from evermap.slam.intake import Prepared, beliefs, prepare, usable_detections
+from evermap.slam.intake import Prepared, beliefs, prepare, prepare_alike
 from evermap.slam.method import Method, Static
 from evermap.slam.mistakes import Finding
-from evermap.slam.problem import Estimate, Problem
+from evermap.slam.problem import Estimate
 from evermap.slam.streaming import StreamingSlam
 from evermap.slam.warmup import warm_up
 from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
@@ -66,32 +66,26 @@ class Solved:
         and their covariances stay as they are, but for what the delay's prior pulled. None where it is not that simple:
         frames would come before or after the odometry, or are tied to what has stamps of its own.
         """
-        prepared, outcome = self.prepared, self.outcome
-        usable, _, _ = usable_detections(recording, ())
-        is_same = np.array_equal(np.flatnonzero(usable), prepared.used)
-        if not is_same or recording.measurements or self.slam is not None:
+        outcome, settings = self.outcome, self.settings.odometry
+        prepared = prepare_alike(self.prepared, self.recording, recording, settings)
+        if prepared is None or recording.measurements or self.slam is not None:
             return None
-
-        def earlier(problem: Problem) -> Problem:
-            return replace(problem, stamp_s=problem.stamp_s - by_s)
+        smoother = outcome.smoother
+        earlier = replace(smoother.problem, stamp_s=prepared.problem.stamp_s[: len(smoother.problem.stamp_s)])
 
         def delayed(estimate: Estimate) -> Estimate:
             states = estimate.states.copy()
             states[DELAY] += by_s
             return replace(estimate, states=states)
 
-        return replace(
-            self,
-            recording=recording,
-            prepared=replace(prepared, problem=earlier(prepared.problem)),
-            outcome=replace(
-                outcome,
-                estimate=delayed(outcome.estimate),
-                problem=earlier(outcome.problem),
-                graph_estimate=delayed(outcome.graph_estimate),
-                revision=outcome.revision.earlier(by_s),
-            ),
+        outcome = replace(
+            outcome,
+            estimate=delayed(outcome.estimate),
+            smoother=smoother.under(smoother.noise, heavy=smoother.heavy, problem=earlier),
+            graph_estimate=delayed(outcome.graph_estimate),
+            revision=outcome.revision.earlier(by_s),
         )
+        return replace(self, recording=recording, prepared=prepared, outcome=outcome)
 
 
 def solve(
