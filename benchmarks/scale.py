@@ -449,9 +449,8 @@ if __name__ == "__main__":
     parser.add_argument("--turns", type=int, default=BESIDE_TURNS)
     arguments = parser.parse_args()
     em.run_slam(simulate_warehouse(WARM_UP))
-    print(
-        "| landmarks | run_slam [CPU s] | gtsam's LM from 0.5 m off | from odometry | ratios |\n|---:|---:|---:|---:|---:|"
-    )
+    heads = ("landmarks", "run_slam [CPU s]", "gtsam's LM from 0.5 m off", "from odometry", "ratios")
+    print(f"| {' | '.join(heads)} |\n|{'---:|' * len(heads)}")
     for size in arguments.landmarks:
         least = beside_optimum(size, arguments.turns)
         own, near, odometry = least["evermap"], least["near"], least["odometry"]
