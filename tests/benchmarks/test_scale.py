@@ -76,6 +76,17 @@ def test_both_sides_solve_the_same_problem(row: dict[str, Any]) -> None:
     assert row["evermap"]["rmse_m"] < 0.1
 
 
+def test_a_session_is_measured_beside_the_optimum_alone(scale: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each contender the least of its turns, without what gtsam takes for its graph or for marginals."""
+    took = iter([4.0, 3.0, 5.0])
+    result = type("Result", (), {"cpu_s": property(lambda _: next(took))})
+    monkeypatch.setattr(scale, "spent", lambda _: result())
+    found = scale.beside_optimum(SMALL, turns=3)
+    assert found["evermap"] == 3.0
+    assert set(found) == {"evermap", "near", "odometry"}
+    assert 0.0 < found["near"] < 1.0
+
+
 def test_times_of_frames_are_those_of_the_stream(stream: dict[str, Any]) -> None:
     assert stream["median_ms"] <= stream["p99_ms"] <= stream["longest_ms"]
     assert stream["rmse_m"] < 0.1

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evermap import run_slam
+from evermap.config import SlamConfig
 from evermap.explain.faults import find_unseen_jumps
+from evermap.maps.sessions import session
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.types import Recording, SlamResult
+from evermap.slam.calibration import DELAY
+from evermap.slam.estimate import Solved, solve
+from evermap.slam.method import Rival
+from evermap.slam.result import concluded
+from evermap.types import UNKNOWN, ChangeKind, MapChange, Measurements, Recording, SlamResult
 
 from .worlds import World
 
@@ -43,6 +50,79 @@ def test_poses_are_where_the_robot_was_though_the_sensor_is_late(late_s: float) 
     assert delay.value == pytest.approx(-late_s, abs=0.01)
     assert delay.p_needed == 1.0
     assert 0.0 < delay.sigma < 0.02
+
+
+def solved_late() -> tuple[Solved, Recording, float]:
+    """The solution of a recording whose sensor is late, and the recording at the stamps that it should have had."""
+    late = record(0.2)
+    solved = solve(late, SlamConfig())
+    late_s = -float(solved.outcome.estimate.states[DELAY])
+    right = replace(late, frames=replace(late.frames, stamp_s=late.frames.stamp_s - late_s))
+    return solved, right, late_s
+
+
+def test_a_solution_at_earlier_frames_is_that_of_a_recording_with_these() -> None:
+    solved, right, late_s = solved_late()
+    moved = solved.with_earlier_frames(right, late_s)
+    assert moved is not None
+    again, result = concluded(solve(right, SlamConfig())), concluded(moved)
+    np.testing.assert_array_equal(result.trajectory.stamp_s, again.trajectory.stamp_s)
+    path, other = result.trajectory, again.trajectory
+    sigma = np.sqrt(np.diagonal(other.covariance, axis1=1, axis2=2))
+    sigma[0] = np.inf  # the first is where it is
+    assert np.abs((path.pose_world_robot - other.pose_world_robot) / sigma).max() < 0.1
+    np.testing.assert_allclose(np.diagonal(path.covariance, axis1=1, axis2=2)[1:], sigma[1:] ** 2, rtol=0.15)
+    for stamp_s in ("first_seen_s", "last_seen_s"):
+        np.testing.assert_allclose(getattr(result.landmarks, stamp_s), getattr(again.landmarks, stamp_s))
+    np.testing.assert_allclose(result.innovations.stamp_s, again.innovations.stamp_s)
+    assert moved.outcome.estimate.states[DELAY] == 0.0
+    # motions between frames are those of the same odometry, so residuals are the same to rounding
+    before, after = (one.outcome.problem for one in (solved, moved))
+    motion = before.drive.between(before.stamp_s, solved.outcome.graph_estimate.states)
+    same = after.drive.between(after.stamp_s, moved.outcome.graph_estimate.states)
+    np.testing.assert_allclose(same.increment, motion.increment, atol=1e-9)
+
+
+def test_what_changed_within_a_session_was_earlier_too() -> None:
+    solved, right, late_s = solved_late()
+    change = MapChange((0,), ChangeKind.MOVED, 10.0, 20.0, (0.5, 0.0), 0.0, 0.9)
+    rival = Rival((change,), 0.1, np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    revision = replace(solved.outcome.revision, changes=(change,), rivals=(rival,))
+    solved = replace(solved, outcome=replace(solved.outcome, revision=revision))
+    moved = solved.with_earlier_frames(right, late_s)
+    assert moved is not None
+    for one in (*moved.outcome.revision.changes, *moved.outcome.revision.rivals[0].changes):
+        assert (one.stamp_from_s, one.stamp_to_s) == pytest.approx((10.0 - late_s, 20.0 - late_s))
+
+
+def test_a_solution_is_not_taken_over_where_frames_come_before_the_odometry() -> None:
+    solved, right, late_s = solved_late()
+    assert right.odometry is not None
+    since_s = 0.5 * (right.frames.stamp_s[0] + solved.recording.frames.stamp_s[0])
+    odometry = right.odometry[right.odometry.stamp_s >= since_s]
+    assert solved.with_earlier_frames(replace(right, odometry=odometry), late_s) is None
+    fixes = solve(replace(right, odometry=odometry), SlamConfig())  # but solved again
+    assert len(fixes.prepared.used) < len(solved.prepared.used)
+
+
+def test_a_solution_is_not_taken_over_where_other_measurements_tie_frames_to_their_own_stamps() -> None:
+    solved, right, late_s = solved_late()
+    place = np.full(1, UNKNOWN)
+    tied = Measurements("loop", np.array([5.0]), {"to_stamp_s": np.array([6.0])}, place)
+    assert solved.with_earlier_frames(replace(right, measurements=(tied,)), late_s) is None
+
+
+def test_a_late_sensor_costs_no_second_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[Recording]()
+
+    def counted(recording: Recording, *args: Any, **more: Any) -> Solved:
+        made.append(recording)
+        return solve(recording, *args, **more)
+
+    monkeypatch.setattr(session, "solve", counted)
+    result = run_slam(record(0.2))
+    assert [(one.code, one.subject) for one in result.causes] == [("clock", "sensor")]
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.01])

@@ -23,8 +23,11 @@ from .worlds import World
 CONFIG = Config.model_validate({"slam": {"explain": {"on": False}}})
 
 
-def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised() -> None:
-    visit, _, inputs = session.explained(Inputs.of(World(seed=2).plane(), None), CONFIG, ())
+@pytest.mark.parametrize("in_map", [False, True])
+def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised(*, in_map: bool) -> None:
+    recording = World(seed=2).plane()
+    given = recording.true_landmarks if in_map else None
+    visit, _, inputs = session.explained(Inputs.of(recording, given), CONFIG, ())
     solved: Any = session.solution_of(visit)
     assert isinstance(solved, Solved)
     screen, asked = Screen.of(optimum_of(solved)), set()
@@ -33,9 +36,13 @@ def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised() -> N
         found, step = change_by(solved, screen, inputs, suspect), STEP * suspect.sigma
         if found is None:  # a clock that leaves frames behind the odometry
             continue
-        other = prepare(suspect.undo(inputs, step).recording, None, (), solved.settings.odometry).problem  # type: ignore[arg-type]
+        undone = suspect.undo(inputs, step)
+        other = prepare(undone.recording, None, (), solved.settings.odometry).problem  # type: ignore[arg-type]
         names = ("stamp_s", "drive", "reading", "sigma_given", "mount")
         moved = replace(problem, **{name: getattr(other, name) for name in names})
+        if given is not None and undone.prior_map is not None:
+            rows = np.searchsorted(given.landmark_id, solved.prepared.landmark_id)
+            moved = replace(moved, landmark_mean=undone.prior_map.position_m[rows])
         smoother = Smoother(moved, solved.outcome.noise.noise, robust=solved.settings.robust)
         now = exhausted(replace(graph, blocks=smoother.blocks(state.known)).linearised(state))
         expected = (residuals_of(graph, now)[0] - screen.residual) / step
@@ -43,6 +50,7 @@ def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised() -> N
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), suspect.subject
         asked.add(suspect.code)
     assert {"range-scale", "odometry-scale", "turn-scale", "mount"} <= asked
+    assert ("map-scale" in asked) == in_map
 
 
 def test_a_lens_changes_residuals_as_if_all_were_read_again() -> None:

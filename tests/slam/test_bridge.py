@@ -115,3 +115,22 @@ def test_dead_reckoning_composes_the_increments():
         once = integrated(world.problem.drive, stamps[0], stamps[k], states).covariance(world.noise.odometry**2)
         sigma = np.sqrt(np.diag(once))
         assert np.abs((covariance[k] - once) / np.outer(sigma, sigma)).max() < 0.02
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_at_the_instants_of_poses_these_are_the_poses(seed):
+    """And others are what they are without those among them."""
+    world = make_world(seed, n_poses=12, prior=PLAIN, step_s=3.0, noise=CALM)
+    estimate, marginals = smoothed(world, world.truth)
+    own = world.problem.stamp_s
+    given = (
+        own, estimate.pose, marginals.pose, marginals.consecutive, world.problem.drive, estimate.states, world.noise,
+    )  # fmt: skip
+    pose, covariance = bridged(own, *given)
+    np.testing.assert_array_equal(pose, estimate.pose)
+    np.testing.assert_allclose(covariance, marginals.pose, rtol=1e-9, atol=1e-15)
+    others = np.concatenate([[own[0] - 0.5], own[:-1] + 0.4 * np.diff(own), [own[-1] + 0.5]])
+    every = np.sort(np.concatenate([own, others]))
+    both, alone = bridged(every, *given), bridged(others, *given)
+    for all_of_them, some in zip(both, alone, strict=True):
+        np.testing.assert_array_equal(all_of_them[np.isin(every, others)], some)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Generic, TypeAlias, TypeVar
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -182,7 +182,12 @@ class Explained(Generic[VisitT]):
     weighed: tuple[Trial[VisitT], ...] = field(default=())
 
 
-Solve = Callable[[Inputs], SessionSolution[VisitT]]
+class Solve(Protocol[VisitT]):
+    """Solves inputs; `known` is their solution in the plane, where there is one."""
+
+    def __call__(self, inputs: Inputs, known: Solved | None = None, /) -> SessionSolution[VisitT]: ...
+
+
 Asked: TypeAlias = list[tuple[float, Suspect, float]]
 """Causes with what they gain [nats] and the state that is tried first."""
 
@@ -278,12 +283,11 @@ def explain(
     """
     rules = config.explain
     late = None if solution is None else _find_late_sensor(solution.result, inputs)
-    now = None if late is None else _solve_trial(inputs, (), late.suspect, late.state, solve_under, _Budget(1))
-    if late is not None and now is not None and _find_late_sensor(now.solution.result, now.inputs) is None:
-        since = explain(
-            now.inputs, now.solution, solve_under, config, say, is_read_well=is_read_well, is_suspected=is_suspected
-        )
-        return None if since is None else _with_late_sensor(since, late, now.solution.result)
+    punctual = None if solution is None or late is None else _solve_at_true_stamps(inputs, solution, late, solve_under)
+    if late is not None and punctual is not None:
+        given, now = punctual
+        since = explain(given, now, solve_under, config, say, is_read_well=is_read_well, is_suspected=is_suspected)
+        return None if since is None else _with_late_sensor(since, late, now.result)
     screens: tuple[Callable[..., Asked], ...] = (_plain, _screen_continuous)  # what costs nothing first
     if solution is not None:
         symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
@@ -328,6 +332,26 @@ def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
         return None
     suspect = next(one for one in list_suspects(inputs, calibrations=True) if one.code == CLOCK)
     return Taken(suspect, -delay.value, delay.sigma**-2)
+
+
+def _solve_at_true_stamps(
+    inputs: Inputs, solution: SessionSolution[VisitT], late: Taken, solve_under: Solve[VisitT]
+) -> tuple[Inputs, SessionSolution[VisitT]] | None:
+    """Return inputs with frames at the stamps that they should have had, and their solution; None where the sensor is
+    late all the same.
+
+    Where the same motions are between the same frames, it is the solution that is there.
+    """
+    given = late.suspect.undo(inputs, late.state)
+    session, recording = solution.session, given.recording
+    known = None
+    if isinstance(session, Solved) and not is_in_space(recording):
+        known = session.with_earlier_frames(recording, late.state)
+    try:
+        now = solve_under(given, known)
+    except EvermapError:  # nothing can be estimated then
+        return None
+    return None if _find_late_sensor(now.result, given) is not None else (given, now)
 
 
 def _with_late_sensor(explained: Explained[VisitT], late: Taken, result: SlamResult) -> Explained[VisitT]:

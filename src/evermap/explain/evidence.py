@@ -147,7 +147,9 @@ def optimum_of(session: AnySession, changes: tuple[MapChange, ...] = ()) -> Opti
 def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
     outcome, problem, noise = solved.outcome, solved.outcome.problem, solved.outcome.noise.noise
     state = outcome.graph_estimate
-    smoother = Smoother(problem, noise, robust=solved.settings.robust)
+    smoother = outcome.smoother
+    if smoother.heavy or smoother.robust != solved.settings.robust or smoother.noise is not noise:
+        smoother = Smoother(problem, noise, robust=solved.settings.robust)
     graph, now = smoother.graph(state), smoother.linearised(state)
     sigma = noise.of_detections(problem.sigma_given)
     nominal = intake.beliefs(solved.recording.sensor, solved.settings)[1].of_detections(problem.sigma_given)

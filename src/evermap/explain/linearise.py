@@ -14,7 +14,7 @@ from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Optimum, 
 from evermap.geometry import se2, se3
 from evermap.slam.calibration import DELAY
 from evermap.slam.estimate import Solved
-from evermap.slam.intake import prepare
+from evermap.slam.intake import place_map, prepare_alike
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.bridge import PathFrames
@@ -149,16 +149,15 @@ def _residuals_under(
 
 def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undone: Inputs) -> FloatArray | None:
     assert not is_in_space(undone.recording)
-    prepared = prepare(undone.recording, undone.prior_map, (), session.settings.odometry)
-    problem, other, before = session.outcome.problem, prepared.problem, session.prepared
-    if not (np.array_equal(prepared.used, before.used) and np.array_equal(prepared.pose_frame, before.pose_frame)):
+    problem, before = session.outcome.problem, session.prepared
+    prepared = prepare_alike(before, session.recording, undone.recording, session.settings.odometry)
+    if prepared is None or len(prepared.problem.stamp_s) != len(problem.stamp_s):
         return None
-    if len(other.stamp_s) != len(problem.stamp_s):
-        return None
-    mean = problem.landmark_mean.copy()
-    if prepared.prior_map is not None and before.prior_map is not None and undone.prior_map is not inputs.prior_map:
-        count = len(before.prior_map.mean)
-        mean[:count] += np.where(before.prior_map.given[:, None], prepared.prior_map.mean - before.prior_map.mean, 0.0)
+    other, mean = prepared.problem, problem.landmark_mean
+    if before.prior_map is not None and undone.prior_map is not None and undone.prior_map is not inputs.prior_map:
+        there, given = place_map(undone.prior_map, before.landmark_id), before.prior_map.given
+        mean, count = mean.copy(), len(before.prior_map.mean)
+        mean[:count] += np.where(given[:, None], there.mean - before.prior_map.mean, 0.0)
     moved: Problem = replace(
         problem, stamp_s=other.stamp_s, drive=other.drive, reading=other.reading, sigma_given=other.sigma_given,
         mount=other.mount, landmark_mean=mean,
@@ -169,6 +168,8 @@ def _residuals_in_plane(session: Solved, optimum: Optimum, inputs: Inputs, undon
         del blocks[ODOMETRY]
     if all(np.array_equal(getattr(moved, of), getattr(problem, of), equal_nan=True) for of in SEEN):
         del blocks[DETECTIONS]
+    if mean is problem.landmark_mean:
+        blocks = {kind: blocks[kind] for kind in (ODOMETRY, DETECTIONS) if kind in blocks}
     return residuals_of(optimum.graph, optimum.graph.relinearise_blocks(optimum.now, optimum.state, blocks))[0]
 
 

@@ -82,7 +82,7 @@ class Outcome:
         prior: of the states, free those that are needed, as the user means it.
         p_needed: (11,) probability of each state to be another than stated; nan where it was not asked.
         askew: direction in which the robot drives, from its front, and its standard deviation [rad].
-        problem: with the start and priors that the optimum belongs to, in the graph's metres.
+        smoother: that the optimum was found with; its problem has the start and priors of that, in the graph's metres.
         graph_estimate, graph_marginals: values and covariances as the graph holds them, before the scale was divided.
         fit_marginals: the covariances of the fit, with errors that last as if they were independent.
         noise: levels and how well they are known.
@@ -97,7 +97,7 @@ class Outcome:
     prior: CalibrationPrior
     p_needed: FloatArray
     askew: tuple[float, float]
-    problem: Problem
+    smoother: Smoother
     graph_estimate: Estimate
     graph_marginals: Marginals
     fit_marginals: Marginals
@@ -107,6 +107,11 @@ class Outcome:
     log_scale_sigma: float
     aligned: bool
     revision: Explanation
+
+    @property
+    def problem(self) -> Problem:
+        """All measurements, with the priors that the optimum belongs to."""
+        return self.smoother.problem
 
 
 class SolvedPart(NamedTuple):
@@ -509,7 +514,7 @@ def divided(
         prior=prior,
         p_needed=p_needed,
         askew=(askew[0], askew[1]),
-        problem=smoother.problem,
+        smoother=smoother,
         graph_estimate=estimate,
         graph_marginals=marginals if others else smoother.counted(estimate, marginals),
         fit_marginals=marginals,

@@ -79,7 +79,27 @@ def bridged(
     Returns:
         (K, 3) poses and (K, 3, 3) covariances in the robot's frame.
     """
-    n, before = len(pose), np.searchsorted(pose_stamp_s, stamp_s, side="right") - 1
+    before = np.searchsorted(pose_stamp_s, stamp_s, side="right") - 1
+    of = np.maximum(before, 0)
+    out, spread = pose[of], covariance[of]
+    between = np.flatnonzero(stamp_s != pose_stamp_s[of])
+    if len(between):
+        ends = pose_stamp_s, pose, covariance, consecutive
+        out[between], spread[between] = _between_ends(stamp_s[between], before[between], ends, drive, states, noise)
+    return out, _semidefinite(0.5 * (spread + spread.transpose(0, 2, 1)))
+
+
+def _between_ends(
+    stamp_s: FloatArray,
+    before: IntArray,
+    ends: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    drive: Drive,
+    states: FloatArray,
+    noise: Noise,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what `bridged` does, at stamps (K,) that are no poses', which follow poses `before` (K,), or -1."""
+    pose_stamp_s, pose, covariance, consecutive = ends
+    n = len(pose)
     increment, collected = np.zeros((2, len(stamp_s), 3)), np.zeros((2, len(stamp_s), 3, 3))
     odometry = drive.stamp_s, drive.velocity, drive.unknown
     _integrate_legs(stamp_s, pose_stamp_s, before, *odometry, states, noise.odometry**2, increment, collected)
@@ -100,7 +120,7 @@ def bridged(
     out[some] = se2.compose(out[some], np.einsum("kij,kj->ki", chain.gain, closing))
     joint = joint_of_ends(covariance[of], covariance[of + 1], consecutive[of])
     spread[some] = chain.by_ends @ joint @ np.swapaxes(chain.by_ends, 1, 2) + chain.lost
-    return out, _semidefinite(0.5 * (spread + spread.transpose(0, 2, 1)))
+    return out, spread
 
 
 def _semidefinite(covariance: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,11 +12,12 @@ from evermap import plugins
 from evermap.config import SlamConfig
 from evermap.interrupts import watched
 from evermap.slam.batch import Batch, Outcome, SolvedPart
-from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.calibration import DELAY, CalibrationPrior
 from evermap.slam.changes.joint import Joint, may_search
-from evermap.slam.intake import Prepared, beliefs, prepare
+from evermap.slam.intake import Prepared, beliefs, prepare, prepare_alike
 from evermap.slam.method import Method, Static
 from evermap.slam.mistakes import Finding
+from evermap.slam.problem import Estimate
 from evermap.slam.streaming import StreamingSlam
 from evermap.slam.warmup import warm_up
 from evermap.types import FloatArray, Landmarks, Progress, Recording, Sensor
@@ -57,6 +58,34 @@ class Solved:
     def end_s(self) -> float:
         """Stamp of the last frame that was processed."""
         return self.prepared.start_s + float(self.outcome.problem.stamp_s[-1])
+
+    def with_earlier_frames(self, recording: Recording, by_s: float) -> Solved | None:
+        """Return the same solution at frames that were so much earlier, in the same `recording` but for their stamps.
+
+        Only the sum of a frame's stamp and the odometry's delay says which motions are before a frame. So poses, places
+        and their covariances stay as they are, but for what the delay's prior pulled. None where it is not that simple:
+        frames would come before or after the odometry, or are tied to what has stamps of its own.
+        """
+        outcome, settings = self.outcome, self.settings.odometry
+        prepared = prepare_alike(self.prepared, self.recording, recording, settings)
+        if prepared is None or recording.measurements or self.slam is not None:
+            return None
+        smoother = outcome.smoother
+        earlier = replace(smoother.problem, stamp_s=prepared.problem.stamp_s[: len(smoother.problem.stamp_s)])
+
+        def delayed(estimate: Estimate) -> Estimate:
+            states = estimate.states.copy()
+            states[DELAY] += by_s
+            return replace(estimate, states=states)
+
+        outcome = replace(
+            outcome,
+            estimate=delayed(outcome.estimate),
+            smoother=smoother.under(smoother.noise, heavy=smoother.heavy, problem=earlier),
+            graph_estimate=delayed(outcome.graph_estimate),
+            revision=outcome.revision.earlier(by_s),
+        )
+        return replace(self, recording=recording, prepared=prepared, outcome=outcome)
 
 
 def solve(

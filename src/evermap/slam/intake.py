@@ -106,9 +106,46 @@ def prepare(
         measurements=tuple(of for of in seen.measurements if of.kind.frame is None),
     )
     framed = tuple(of for of in seen.measurements if of.kind.frame is not None)
-    in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
+    in_map = None if prior_map is None else place_map(prior_map, landmark_id)
     remarks = (*warnings, *seen.left_out)
     return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, remarks, framed)
+
+
+def prepare_alike(
+    prepared: Prepared, given: Recording, other: Recording, settings: OdometryConfig = USUAL
+) -> Prepared | None:
+    """Return another recording as input where it has the same poses and detections of the same landmarks; else None.
+
+    What its measurements of other kinds and its map say stays as it was.
+
+    Args:
+        prepared: a recording as input.
+        given: the recording.
+        other: the same recording but for numbers that were measured, stamps or the mount.
+        settings: limits of odometry.
+    """
+    usable, moving, _ = usable_detections(other, ())
+    if not np.array_equal(np.flatnonzero(usable), prepared.used):
+        return None
+    stamps, odometry, seen, used = other.frames.stamp_s, other.odometry, other.detections, prepared.used
+    if other.measurements and not np.array_equal(
+        frames_with_pose(other, np.unique(seen.frame[used]), moving), prepared.pose_frame
+    ):
+        return None
+    start_s = float(odometry.stamp_s[0])
+    problem = replace(
+        prepared.problem,
+        stamp_s=stamps[prepared.pose_frame] - start_s,
+        drive=prepared.problem.drive if odometry is given.odometry else Drive.of(other, settings),
+        mount=np.array(other.sensor.mount_robot_sensor, dtype=np.float64),
+    )
+    if seen is not given.detections:
+        problem = replace(
+            problem,
+            reading=np.column_stack([seen.range_m[used], seen.bearing_rad[used]]),
+            sigma_given=np.column_stack([seen.sigma_range_m[used], seen.sigma_bearing_rad[used]]),
+        )
+    return replace(prepared, problem=problem, start_s=start_s)
 
 
 class Connected(NamedTuple):
@@ -254,8 +291,8 @@ def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noi
     return prior, replace(start, detection=detection, odometry=start.odometry * settings.odometry_noise_factor)
 
 
-def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
-    """The prior map in the order of this session's landmarks; a sigma of zero means 1 mm."""
+def place_map(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap:
+    """Return the prior map in the order of this session's landmarks; a sigma of zero means 1 mm."""
     _, own, row = np.intersect1d(landmark_id, prior_map.landmark_id, return_indices=True)
     mean, information = np.zeros((len(landmark_id), 2)), np.zeros((len(landmark_id), 2, 2))
     mean[own] = prior_map.position_m[row]

@@ -8,7 +8,7 @@ stands in `Problem.landmark_row`, and nothing else tells the estimator of moves:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -58,6 +58,17 @@ class Explanation:
     changes: tuple[MapChange, ...] = ()
     rivals: tuple[Rival, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def earlier(self, by_s: float) -> Explanation:
+        """Return the same with all that happened so much earlier."""
+
+        def moved(changes: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
+            return tuple(
+                replace(one, stamp_from_s=one.stamp_from_s - by_s, stamp_to_s=one.stamp_to_s - by_s) for one in changes
+            )
+
+        rivals = tuple(replace(rival, changes=moved(rival.changes)) for rival in self.rivals)
+        return replace(self, changes=moved(self.changes), rivals=rivals)
 
 
 class Method(Protocol):

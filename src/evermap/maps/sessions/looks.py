@@ -175,6 +175,8 @@ def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int,
     """The rate of a session, by what was missed between the first and the last time that a site was seen; of lines (K,)
     their detection probability before the session, and whether they are known to be clear.
     """
+    if not known.any():  # as in a map that begins
+        return 1.0
     first, last = first_and_last(rows.site[rows.hit], rows.stamp_s[rows.hit], n_sites)
     there = (rows.stamp_s > first[rows.site]) & (rows.stamp_s < last[rows.site]) & known[rows.key]
     site = rows.site[there]

@@ -37,7 +37,7 @@ from evermap.show import Shown
 from evermap.slam import plane
 from evermap.slam.association.features import medians
 from evermap.slam.cleaning import clean
-from evermap.slam.estimate import solve
+from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import unusable
 from evermap.slam.space.up import with_known_up
 from evermap.types import (
@@ -443,8 +443,12 @@ def explained(
         DataError, NumericalError: as of `run_slam`.
     """
 
-    def under(given: Inputs, **more: Any) -> SessionSolution[Visit]:
-        visit = solved(given.recording, config, given.prior_map, remarks, **more)
+    def under(given: Inputs, known: Solved | None = None, **more: Any) -> SessionSolution[Visit]:
+        visit: Visit
+        if known is None:
+            visit = solved(given.recording, config, given.prior_map, remarks, **more)
+        else:
+            visit = PlanarVisit(known)
         result = visit.concluded()
         if not np.isfinite(result.trajectory.pose_world_robot).all():
             raise NumericalError("the solution has poses that are no numbers", hint="check units, mounts and stamps")
