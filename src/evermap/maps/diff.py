@@ -73,7 +73,7 @@ class Difference(Shown):
         a, b: the revisions.
         changes: net effect of the changes reported between them.
         grown: (N,) landmarks that are present in `b` and unknown in `a`, without having appeared.
-        edits: by operators: landmark and 'pinned', 'unpinned', 'deleted' or 'undeleted'.
+        edits: by operators: landmark and 'pinned', 'unpinned', 'deleted', 'undeleted' or 'renamed from ...'.
     """
 
     a: int
@@ -113,7 +113,8 @@ def diff(store: MapStore, a: int, b: int | None = None) -> Difference:
     told, new = collect_changes(store, a, b)
     changes = tuple(change.named(names) for change in net(told, before, after, new=new))
     more = grown(before.members.landmark_id, after, changes)
-    return Difference(a, b, changes, more, edits(before.members, after.members))
+    said = sorted([*edits(before.members, after.members), *renames(before, after)])
+    return Difference(a, b, changes, more, tuple(said))
 
 
 def story_of(store: MapStore, revision: int | None = None) -> tuple[Chapter, ...]:
@@ -301,6 +302,13 @@ def edits(a: Members, b: Members) -> tuple[tuple[int, str], ...]:
         before, after = getattr(a, name)[row_a], getattr(b, name)[row_b]
         words += [(int(ids[k]), yes if after[k] else no) for k in np.flatnonzero(before != after)]
     return tuple(sorted(words))
+
+
+def renames(a: LivingMap, b: LivingMap) -> tuple[tuple[int, str], ...]:
+    """Return which landmarks operators have renamed between two maps, and what they were called before."""
+    named = dict(a.renamed.items()).items() ^ dict(b.renamed.items()).items()
+    both = np.intersect1d(np.intersect1d(a.members.landmark_id, b.members.landmark_id), [one for one, _ in named])
+    return tuple((int(one), f"renamed from {a.label(int(one))}") for one in both)
 
 
 def motion_of(

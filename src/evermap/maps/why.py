@@ -169,7 +169,8 @@ def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tup
 
 def _with_words(answer: Answer, living: LivingMap) -> Answer:
     """Return the same with its headline and reasons."""
-    kind = f" ({answer.class_name})" if answer.class_name else ""
+    said = answer.label.startswith(answer.class_name)
+    kind = "" if said else f" ({answer.class_name})"
     what = f"landmark {answer.label}{kind}"
     belief = f"P(exists) {_belief(answer.p_exists)}"
     if answer.deleted:
@@ -181,7 +182,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
     reasons = [f"an operator {word} it in revision {number} ({when})" for number, when, word in answer.edits]
     reasons += _on_sightings(answer, living)
     if answer.companions:
-        others = ", ".join(str(name) for name in answer.companions)
+        others = ", ".join(map(living.label, answer.companions))
         word = "landmarks" if len(answer.companions) > 1 else "landmark"
         reasons.append(f"it shares a body with {word} {others}: hits and misses of all of them count")
     if answer.pinned:
@@ -292,5 +293,5 @@ def _unknown(living: LivingMap, name: str) -> str:
     if number >= 0:
         near = sorted(names[np.argsort(np.abs(names - number), kind="stable")[:3]].tolist())
         return f"no landmark {name}; the nearest ids are {', '.join(map(living.label, near))}"
-    meant = similar(name, living.landmark_texts, cutoff=0.0)
+    meant = similar(name, [*living.landmark_names.values()], cutoff=0.0)
     return f"no landmark {name!r}" + (f"; there is {meant}" if meant else "; all have numbers")

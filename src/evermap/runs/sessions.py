@@ -252,11 +252,7 @@ def edit_landmarks(
     parent = store.head()
     before = after = store.load(parent)
     for name in landmarks:
-        try:
-            after = after.edited(after.landmark_called(name), **WORDS[word])
-        except KeyError:
-            problem = f"no landmark {name} in revision {parent}"
-            raise InputError(problem, path=store.where, hint=f"evermap map show {store.where} --all") from None
+        after = after.edited(_landmark_of(store, before, parent, name), **WORDS[word])
     changed = tuple(name for name, _ in edits(before.members, after.members))
     if not changed:
         return parent, (), f"already {word}"
@@ -264,6 +260,44 @@ def edit_landmarks(
     said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
     origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
     return store.commit(after, origin, parent=parent), changed, said
+
+
+def rename_landmark(
+    store: MapStore, landmark: str, name: str, *, note: str = "", command: str = ""
+) -> tuple[int, str, str]:
+    """Commit what an operator calls a landmark from now on, in all sessions, unless it is called so; '' takes his name
+    back. Its identity, by which it is found in recordings, stays.
+
+    Returns:
+        The newest revision, what the landmark is called in it, and what the log says.
+
+    Raises:
+        InputError: the landmark is not in the map, or it cannot be called so.
+        StaleRevisionError: another commit came in between.
+    """
+    parent = store.head()
+    before = store.load(parent)
+    identity = _landmark_of(store, before, parent, landmark)
+    after = before.with_name(identity, name)
+    was, called = before.label(identity), after.label(identity)
+    if was == called:
+        return parent, called, "it is called so already"
+    said = f"renamed landmark {was} to {called}" + (f": {note}" if note else "")
+    origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
+    return store.commit(after, origin, parent=parent), called, said
+
+
+def _landmark_of(store: MapStore, living: LivingMap, number: int, name: str) -> int:
+    """Return the id of a landmark of a revision by what it is called.
+
+    Raises:
+        InputError: it has none.
+    """
+    identity = living.landmark_called(name)
+    if identity not in living.members.landmark_id:
+        problem = f"no landmark {printable(name, 80)} in revision {number}"
+        raise InputError(problem, path=store.where, hint=f"evermap map show {store.where} --all")
+    return identity
 
 
 def _enter_late(
@@ -589,7 +623,10 @@ def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
 
 
 def _with_words(living: LivingMap, newest: LivingMap, clock: Clock) -> LivingMap:
-    """An earlier map with what users said of lifetimes, which is of no time; one without places gets a clock."""
+    """An earlier map with what users said of lifetimes, and what they call landmarks, which are of no time; one without
+    places gets a clock.
+    """
+    living = replace(living, renamed=newest.renamed)
     lives = replace(living.lives, prior_class_id=newest.lives.prior_class_id, prior=newest.lives.prior)
     living = replace(living, class_names=newest.class_names, lives=lives) if len(lives.prior) else living
     return living if len(living.places) else replace(living, clock=clock)
@@ -645,7 +682,8 @@ def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequenc
         assert isinstance(old, SqlStore)
         log, start = {item.number: item for item in old.log()}, _last_revert(old)
         same = old.named(log[start].restores)[1] == fresh.named(base)[1]
-        if not same or _said(old.load()) != _said(fresh.load(fresh.head() - 1)):
+        was, newest = old.load(), fresh.load(fresh.head() - 1)
+        if not same or _said(was) != _said(newest) or [*was.renamed.items()] != [*newest.renamed.items()]:
             return 0
         kept: dict[str, dict[int, Attachment]] = {RECORDING: {}, TRAJECTORY: {}}
         for item in old.attachments():

@@ -54,7 +54,7 @@ _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
           "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
           "metres.log_metre", "metres.log_variance", "metres.information", "traits.landmark_id",
-          "traits.column_id", "traits.value", "traits.sessions")  # fmt: skip
+          "traits.column_id", "traits.value", "traits.sessions", "renamed.landmark_id", "renamed.name")  # fmt: skip
 """Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -346,6 +346,8 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
             yield f"columns of different lengths in '{name}'"
     if living.sight is not None and (problem := living.sight.flaw()):
         yield problem
+    if len(living.renamed.landmark_id) != len(living.renamed.name):
+        yield "columns of different lengths in 'renamed'"
     if len(living.lives.prior_class_id) != len(living.lives.prior):
         yield "columns of different lengths in 'lives'"
     lines, places = living.sightlines, len(living.places)
@@ -366,7 +368,7 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
 
 def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
     """Sorted unique ids, references that lead somewhere."""
-    for column in ("members.landmark_id", "sites.site_id", "dated.site_id", "boxes.landmark_id"):
+    for column in ("members.landmark_id", "sites.site_id", "dated.site_id", "boxes.landmark_id", "renamed.landmark_id"):
         ids = attrgetter(column)(living)
         if np.any(ids[1:] <= ids[:-1]):
             yield f"'{column}' is not sorted, or not unique"
