@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +12,9 @@ from evermap.errors import InputError, similar
 from evermap.existence.sites import Evidence
 from evermap.maps.diff import edits, story_of
 from evermap.maps.living import EXISTS, LivingMap, Stays
-from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
+from evermap.maps.store.content import DamagedError
+from evermap.maps.store.measured import LOOKS, read_looks
+from evermap.maps.store.protocol import DamagedMapError, MapStore, Revision, RevisionKind
 from evermap.show import Shown
 from evermap.survival.durations import duration_text
 from evermap.types import UNKNOWN, Clock, MapChange, stamp_text
@@ -106,11 +109,11 @@ def why(store: MapStore, landmark: int | str, revision: int | None = None) -> An
     on_it = living.members.landmark_id[living.members.clique_id == clique]
     line = store.lineage(revision)
     log = {item.number: item for item in store.log()}
-    parts = [(number, store.evidence(landmark_id=landmark_id, revisions=[number])) for number in line]
-    evidence = Evidence.empty()
-    for _, part in parts:
-        evidence = evidence.joined(part)
-    visits = tuple(_visit(log[number], part) for number, part in parts if len(part))
+    parts = [part for part in _looks_by_session(store, line, landmark_id).items() if len(part[1])]
+    parts.sort(key=lambda part: float(part[1].stamp_s[0]))
+    evidence = Evidence.empty().joined(*(part for _, part in parts))
+    evidence = evidence[np.argsort(evidence.stamp_s, kind="stable")]
+    visits = tuple(_visit(log[number], part) for number, part in parts)
     changes = tuple(
         (one.revision, change.named(living.landmark_names))
         for one in story_of(store, revision)
@@ -138,6 +141,26 @@ def why(store: MapStore, landmark: int | str, revision: int | None = None) -> An
         reasons=(),
     )
     return _with_words(answer, living)
+
+
+def _looks_by_session(store: MapStore, line: Sequence[int], landmark_id: int) -> dict[int, Evidence]:
+    """Return the looks at a landmark's clique by the revisions of their sessions, as the newest revision counts them:
+    where a late session came in, those of it and of all after it are weighed with it in the map.
+
+    Raises:
+        DamagedMapError: they are not what was written.
+    """
+    late = {item.revision: item for item in store.attachments(line) if item.name == LOOKS}
+    found = dict[int, Evidence]()
+    for number in line:
+        if number not in late:
+            found[number] = store.evidence(landmark_id=landmark_id, revisions=[number])
+            continue
+        try:
+            found |= read_looks(store.attached(late[number]), number, landmark_id)
+        except DamagedError as error:
+            raise DamagedMapError(str(error), path=store.where) from None
+    return found
 
 
 def _visit(revision: Revision, seen: Evidence) -> Visit:

@@ -32,7 +32,15 @@ from evermap.maps.store import (
 )
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.history import STORY, Chapter, pack_story
-from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
+from evermap.maps.store.measured import (
+    LOOKS,
+    RECORDING,
+    TRAJECTORY,
+    pack_looks,
+    pack_recording,
+    pack_trajectory,
+    unpack_recording,
+)
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
 from evermap.types import Progress, VerdictKind, is_in_space
@@ -40,7 +48,9 @@ from evermap.valid import check_type
 
 if TYPE_CHECKING:
     from evermap.existence.lifetimes import Lifetimes
+    from evermap.existence.sites import Evidence
     from evermap.maps.lives import Life
+    from evermap.maps.living import Members
     from evermap.maps.sessions.session import Session
     from evermap.maps.store.sql import SqlStore
     from evermap.types import AnyRecording, Clock, FloatArray, IntArray, Landmarks, MapChange
@@ -329,27 +339,36 @@ def _enter_late(
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
     living = _with_words(living, newest, recording.clock)
     story: list[Chapter] = []
+    looks: dict[int, tuple[Evidence, Members]] = {}
     for step in (step for step in later if step.start_s <= start_s):
-        living = _retold(store, step, living, story)
+        living = _retold(store, step, living, story, looks)
     session = run_session(recording, living, config, progress=progress)
     if not session.found:
         return Entered(session, newest, newest, (), (), head, {})
     story.append(_chapter(0, start_s, session.changes, living, session.living))
     living = session.living
+    looks[0] = session.evidence, living.members
     replayed = [step for step in later if step.start_s > start_s]
     for step in replayed:
-        living = _retold(store, step, living, story)
+        living = _retold(store, step, living, story, looks)
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
-    attached = {RECORDING: data, STORY: pack_story(parent, story)}
+    attached = {RECORDING: data, STORY: pack_story(parent, story), LOOKS: pack_looks(looks)}
     return Entered(session, newest, living, session.changes, names, head, attached)
 
 
-def _retold(store: MapStore, step: _Step, living: LivingMap, story: list[Chapter]) -> LivingMap:
-    """The map after a session or an edit that it has had before; what a session tells is added to the story."""
+def _retold(
+    store: MapStore,
+    step: _Step,
+    living: LivingMap,
+    story: list[Chapter],
+    looks: dict[int, tuple[Evidence, Members]],
+) -> LivingMap:
+    """The map after a session or an edit that it has had before; what a session tells and saw is added to both."""
     if step.recording is None:
         return _edited_again(store, step, living)
     session = _session_again(store, step, living)
     story.append(_chapter(step.revision.number, step.start_s, session.changes, living, session.living))
+    looks[step.revision.number] = session.evidence, session.living.members
     return session.living
 
 
