@@ -957,6 +957,8 @@ class MapChange(Shown):
         n_hits, n_misses: detections at the new place, and expected detections at the old one that did not come: in a
             living map misses count by how probably their lines of sight were clear.
         names: what the landmarks are called, if that is not their numbers; see `labels`.
+        displacement_covariance_m2: in a living map rows of the covariance of `displacement_m`, by the joint Gaussian of
+            both places, with that of the map's metre; () where it is not known.
     """
 
     landmark_ids: tuple[int, ...]
@@ -969,6 +971,13 @@ class MapChange(Shown):
     n_hits: int = 0
     n_misses: int = 0
     names: tuple[str, ...] = field(default=(), compare=False)
+    displacement_covariance_m2: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def displacement_sigma_m(self) -> float:
+        """Standard deviation of its displacement along an axis, the root of their mean variance; nan if unknown."""
+        spread = self.displacement_covariance_m2
+        return math.sqrt(sum(row[k] for k, row in enumerate(spread)) / len(spread)) if spread else math.nan
 
     def named(self, names: Mapping[int, str]) -> MapChange:
         """Return the same with what its landmarks are called, where that is not their numbers."""

@@ -402,6 +402,7 @@ def _composed(
         else:
             kind, rests_on = ChangeKind.MOVED, path
     from_s, to_s = zip(*((one.change.stamp_from_s, one.change.stamp_to_s) for one in rests_on), strict=True)
+    moved = () if goes or kind is ChangeKind.APPEARED else _spread(path, shift, maps[1].log_size_variance)
     return MapChange(
         landmark_ids=names,
         kind=kind,
@@ -412,7 +413,22 @@ def _composed(
         probability=float(np.prod([one.change.probability for one in rests_on])),
         n_hits=sum(one.change.n_hits for one in rests_on),
         n_misses=sum(one.change.n_misses for one in rests_on),
+        displacement_covariance_m2=moved,
     )
+
+
+def _spread(path: Sequence[Told], shift: FloatArray, log_size_variance: float) -> tuple[tuple[float, ...], ...]:
+    """Covariance of what the steps add up to: the sum of theirs, but that the map's metre is one for all; () where one
+    of them is not known.
+    """
+    steps = [one.change for one in path if np.isfinite(one.change.displacement_m).all()]
+    if not steps or not all(one.displacement_covariance_m2 for one in steps):
+        return ()
+    each = sum(
+        np.array(one.displacement_covariance_m2) - log_size_variance * np.outer(one.displacement_m, one.displacement_m)
+        for one in steps
+    )
+    return tuple(map(tuple, (each + log_size_variance * np.outer(shift, shift)).tolist()))
 
 
 def _shift(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: LivingMap) -> tuple[FloatArray, float]:
