@@ -151,11 +151,8 @@ def _looks_by_session(store: MapStore, line: Sequence[int], landmark_id: int) ->
         DamagedMapError: they are not what was written.
     """
     late = {item.revision: item for item in store.attachments(line) if item.name == LOOKS}
-    found = dict[int, Evidence]()
-    for number in line:
-        if number not in late:
-            found[number] = store.evidence(landmark_id=landmark_id, revisions=[number])
-            continue
+    found = store.evidence_by_revision(landmark_id=landmark_id, revisions=[*line])
+    for number in sorted(late):
         try:
             found |= read_looks(store.attached(late[number]), number, landmark_id)
         except DamagedError as error:

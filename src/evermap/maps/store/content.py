@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
@@ -289,11 +289,22 @@ def _of_format_1(parts: dict[str, Any]) -> None:
 
 def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[str, NDArray[Any]]:
     """Return some columns of a map, such as 'members.landmark_id', without reading the rest. Errors as `unpack`."""
-    listed = _manifest(name, fetch)["columns"]
-    wanted = {column: listed.get(column) for column in columns}
-    if None in wanted.values():
+    return unpack_columns_of({name}, columns, fetch)[name]
+
+
+def unpack_columns_of(
+    names: Collection[bytes], columns: Iterable[str], fetch: Fetch
+) -> dict[bytes, dict[str, NDArray[Any]]]:
+    """Return some columns of each of several maps, by their names, with two fetches. Errors as `unpack`."""
+    columns, manifests = [*columns], fetch(names)
+    listed = {name: _manifest(name, lambda _: manifests)["columns"] for name in names}
+    if any(column not in some for some in listed.values() for column in columns):
         raise DamagedError("a column is missing")
-    return _arrays(wanted, fetch)
+    # revisions share columns, of which each is unpacked once
+    distinct = {(column, str(some[column])): some[column] for some in listed.values() for column in columns}
+    keyed = {f"{k}": value for k, value in enumerate(distinct.values())}
+    arrays = dict(zip(distinct, _arrays(keyed, fetch).values(), strict=True))
+    return {name: {column: arrays[column, str(some[column])] for column in columns} for name, some in listed.items()}
 
 
 def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
