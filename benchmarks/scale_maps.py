@@ -5,6 +5,7 @@ it into the map, and to localise in the map, should not depend on the rest eithe
 would have left them: every landmark a clique of its own at one site, seen a while ago.
 
     python -m benchmarks.scale_maps bring_in 1000
+    python -m benchmarks.scale_maps history 1000    # sessions: what reading the file takes, and how it grows
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,11 @@ from benchmarks.memory import ROOT, child_environment, peak_mb
 from benchmarks.scale import Ticks, spent
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance
+from evermap.maps.diff import read_log
 from evermap.maps.living import Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, RevisionKind
 from evermap.maps.vicinity import in_chunks
+from evermap.runs.map_dicts import landmark_dicts
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
@@ -61,6 +64,8 @@ SESSIONS_PER_DAY = 27
 """Of the building: 10,000 in a year."""
 BUILDING_SESSIONS = 40
 """Of the building by default; the claim is about 10,000."""
+DAY_S, NEW_STAYS = 86400.0, 4
+"""Between the sessions of a history, and stays that each begins."""
 COMPLETE_AFTER = 10
 """Sessions after which the map of the building knows all rooms."""
 
@@ -279,6 +284,73 @@ def building(n_sessions: int = BUILDING_SESSIONS, patrol_s: float = 60.0) -> dic
     return building_summary(np.array(rows))
 
 
+def history(n_sessions: int, patrol_s: float = 60.0) -> dict[str, float]:
+    """Measure what `evermap map` takes to read a file of so many sessions, and how many bytes a session adds.
+
+    The map of two sessions of a building is committed over and over, a day later each, with other places,
+    covariances, looks and stays: real sessions would take a thousand times as long. The file has no recordings.
+    """
+    first, second = simulate_building(BuildingConfig(days=2, patrol_s=patrol_s), 1).sessions
+    session = em.run_session(second, em.run_session(first).living)
+    living, rng, sizes = session.living, np.random.default_rng(0), list[int]()
+    stays, most = living.stays, em.Config().living.decisions.most_stays
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.evermap"
+        with em.open_store(path, create=True) as store:
+            for day in range(n_sessions):
+                shift_s = DAY_S * day
+                if day:
+                    new = later_stays(living.stays[np.arange(min(NEW_STAYS, len(living.stays)))], shift_s)
+                    stays = stays.joined(new)
+                    stays = stays[np.argsort(stays.first_s, kind="stable")[-most:]]
+                moved_m = living.places.position_m + 1e-3 * rng.normal(size=living.places.position_m.shape)
+                now = replace(
+                    living,
+                    stamp_s=living.stamp_s + shift_s,
+                    session_start_s=living.session_start_s + shift_s,
+                    places=replace(living.places, position_m=moved_m),
+                    covariance_m2=np.asarray(living.covariance_m2) * (1.0 + 1e-3 * rng.random()),
+                    stays=stays,
+                )
+                seen = replace(session.evidence, stamp_s=session.evidence.stamp_s + shift_s)
+                told = [
+                    replace(one, stamp_from_s=one.stamp_from_s + shift_s, stamp_to_s=one.stamp_to_s + shift_s)
+                    for one in session.changes
+                ]
+                span_s = second.frames.stamp_s[[0, -1]] + shift_s
+                said = Provenance(recording=f"day {day}", stamp_from_s=float(span_s[0]), stamp_to_s=float(span_s[1]))
+                store.commit(now, said, told, seen, parent=day)
+                sizes.append(path.stat().st_size)
+        landmark = int(living.members.landmark_id[0])
+        asked: dict[str, Callable[[Any], Any]] = {
+            "log": read_log,
+            "show": lambda store: landmark_dicts(store.load()),
+            "diff": lambda store: em.diff(store, max(1, n_sessions // 2)),
+            "why": lambda store: em.why(store, landmark),
+        }
+        found = {f"{name}_cpu_s": min(_asked(path, ask) for _ in range(2)) for name, ask in asked.items()}
+    grown = np.diff(sizes)
+    quarter = max(1, len(grown) // 4)
+    return {**found, "first_bytes": float(np.mean(grown[:quarter])), "last_bytes": float(np.mean(grown[-quarter:]))}
+
+
+def later_stays(stays: Stays, shift_s: float) -> Stays:
+    """The same stays at another time, each ended after an hour."""
+    ends = stays.last_s + shift_s + 3600.0
+    times = (stays.elsewhere_s + shift_s, stays.first_s + shift_s, stays.last_s + shift_s, ends)
+    return replace(stays, **dict(zip(("elsewhere_s", "first_s", "last_s", "gone_s"), times, strict=True)))
+
+
+def _asked(path: Path, ask: Callable[[Any], Any]) -> float:
+    """CPU seconds of a question to a map that is opened for it."""
+
+    def whole() -> None:
+        with em.open_store(path) as store:
+            ask(store)
+
+    return spent(whole).cpu_s
+
+
 def building_summary(rows: FloatArray, complete_after: int = COMPLETE_AFTER, most: int = 100) -> dict[str, Any]:
     """Compare the first sessions after the map is complete with the last ones.
 
@@ -380,7 +452,8 @@ def _main(work: str, number: int) -> None:
     in_map = {"bring_in": bring_in, "localise": localise, "opened": opened, "constellations": constellations}
     if work in in_map:
         in_map[work](SMALL.n_landmarks, SMALL)
-    print(json.dumps(in_map[work](number) if work in in_map else building(number)))
+    of_sessions = {"building": building, "history": history}
+    print(json.dumps(in_map[work](number) if work in in_map else of_sessions[work](number)))
 
 
 if __name__ == "__main__":

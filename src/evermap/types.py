@@ -139,6 +139,37 @@ def landmark_id_of(name: str) -> int:
 
 
 _TEXT_IDS = 2**52
+_LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ"  # no I and O, which are read as 1 and 0
+CODE_DIGITS = 12
+"""Of a whole `landmark_code`."""
+
+
+def landmark_code(landmark_id: int, digits: int = 3) -> str:
+    """Return a letter and digits, as 'K381', for an identity that nobody can say; the same wherever it is asked.
+
+    More digits, up to `CODE_DIGITS`, go on from fewer. Multiplicative hashing (Knuth 1973, 6.4) of 64 bits.
+    """
+    number = (landmark_id * 0x9E3779B97F4A7C15) % 2**64 >> 16
+    rest, letter = divmod(number, len(_LETTERS))
+    return _LETTERS[letter] + f"{rest:0{CODE_DIGITS}d}"[-CODE_DIGITS:][:digits]
+
+
+def landmark_label(landmark_id: int, names: Mapping[int, str]) -> str:
+    """Return what a person calls a landmark: its name, else the number that its user gave it, else its code."""
+    name = names.get(landmark_id)
+    if name is not None:
+        return name
+    return str(landmark_id) if is_number(landmark_id) else landmark_code(landmark_id)
+
+
+def is_number(landmark_id: int) -> bool:
+    """Return whether an identity is a number that people count with, rather than that of a text."""
+    return landmark_id < _TEXT_IDS
+
+
+def is_text_of(name: str, landmark_id: int) -> bool:
+    """Return whether the identity of a landmark is this text (`landmark_id_of`), which then names it in tables."""
+    return not is_number(landmark_id) and landmark_id_of(name) == landmark_id
 
 
 class Clock(StrEnum):
@@ -467,6 +498,11 @@ class Landmarks(_Columns):
         if self.class_names:
             found["class"] = [self.class_names[k] if k >= 0 else "" for k in self.class_id.tolist()]
         return found
+
+    @property
+    def labels(self) -> list[str]:
+        """What each landmark is called, (L,)."""
+        return [landmark_label(identity, self.names) for identity in self.landmark_id.tolist()]
 
     def plot(self) -> Figure:
         """Draw the map with 2-sigma ellipses; returns a matplotlib figure."""
@@ -920,7 +956,9 @@ class MapChange(Shown):
         probability: of this very group at this time, over all hypotheses that were weighed.
         n_hits, n_misses: detections at the new place, and expected detections at the old one that did not come: in a
             living map misses count by how probably their lines of sight were clear.
-        names: what the landmarks are called, if any id has a text behind it; see `labels`.
+        names: what the landmarks are called, if that is not their numbers; see `labels`.
+        displacement_covariance_m2: in a living map rows of the covariance of `displacement_m`, by the joint Gaussian of
+            both places, with that of the map's metre; () where it is not known.
     """
 
     landmark_ids: tuple[int, ...]
@@ -933,16 +971,23 @@ class MapChange(Shown):
     n_hits: int = 0
     n_misses: int = 0
     names: tuple[str, ...] = field(default=(), compare=False)
+    displacement_covariance_m2: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def displacement_sigma_m(self) -> float:
+        """Standard deviation of its displacement along an axis, the root of their mean variance; nan if unknown."""
+        spread = self.displacement_covariance_m2
+        return math.sqrt(sum(row[k] for k, row in enumerate(spread)) / len(spread)) if spread else math.nan
 
     def named(self, names: Mapping[int, str]) -> MapChange:
-        """Return the same with what its landmarks are called, where a text is behind any of their ids."""
-        labels = tuple(names.get(identity, str(identity)) for identity in self.landmark_ids)
-        return replace(self, names=labels) if names.keys() & set(self.landmark_ids) else self
+        """Return the same with what its landmarks are called, where that is not their numbers."""
+        labels = tuple(landmark_label(identity, names) for identity in self.landmark_ids)
+        return self if labels == tuple(map(str, self.landmark_ids)) else replace(self, names=labels)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return what its landmarks are called: their texts, or their ids."""
-        return self.names or tuple(map(str, self.landmark_ids))
+        """Return what its landmarks are called: their names, or their numbers."""
+        return self.names or tuple(landmark_label(identity, {}) for identity in self.landmark_ids)
 
 
 @dataclass(frozen=True, slots=True)

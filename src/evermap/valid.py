@@ -32,6 +32,7 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
     is_in_space,
+    landmark_label,
 )
 
 WITHOUT_IDS = "`unknown_ids` associates detections without a landmark_id by geometry"
@@ -334,7 +335,7 @@ def strangers(landmarks: Landmarks, recordings: Iterable[AnyRecording]) -> str:
     names = {**landmarks.names, **{key: name for one in every for key, name in one.landmark_names.items()}}
     listed = []
     for ids in (landmarks.landmark_id.tolist(), seen.tolist()):
-        called = [names.get(identity, str(identity)) for identity in ids]
+        called = [landmark_label(identity, names) for identity in ids]
         listed.append(", ".join(called[:4]) + (f" to {called[-1]}" if len(called) > 4 else ""))
     return f"no landmark of the map was ever seen: the map has {listed[0]}, the recording has {listed[1]}"
 

@@ -14,7 +14,7 @@ from evermap.cli.main import app
 from evermap.geometry import se3
 from evermap.io import read_landmarks, write_native
 from evermap.maps.store import open_store
-from evermap.types import Frames, SpatialDetections, SpatialOdometry, SpatialRecording, SpatialSensor
+from evermap.types import Frames, SpatialDetections, SpatialOdometry, SpatialRecording, SpatialSensor, landmark_code
 
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
 N_TAGS, N_FRAMES = 10, 50
@@ -165,4 +165,5 @@ def test_sessions_in_space_without_identities(tmp_path: Path) -> None:
     assert run("slam", folder, "--unknown-ids", *prior, "--out", tmp_path / "two", *QUICK).exit_code == 0
     found = read_landmarks(tmp_path / "two" / "map.parquet")
     np.testing.assert_array_equal(np.sort(found.landmark_id), first.members.landmark_id)
-    assert all(first.label(one).startswith("landmark-") for one in found.landmark_id.tolist())
+    assert all(first.label(one) == landmark_code(one) for one in found.landmark_id.tolist())
+    assert all(text.startswith("landmark-") for text in first.landmark_texts)

@@ -5,10 +5,12 @@ fresh folder a page. A comment on the line above a block changes that:
 
     <!-- not run: why -->           the block is skipped
     <!-- needs: SOME.zip -->        runs only where that recording is on this machine; it is put into the folder
+    <!-- printed: by what -->       of a `text` block: the commands above it print its lines, '...' for any end of one
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import subprocess
@@ -26,6 +28,7 @@ PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPO
 GENERATED = "reference/"
 """Pages that exist only in the site; `mkdocs build --strict` checks what leads there."""
 TIMEOUT_S = 300
+NUMBER = re.compile(r"([-+]?\d+(?:\.\d+)?)")
 LONG = re.compile(r"evermap (?:demo|slam(?! --init)|simulate|check|live)")
 
 
@@ -46,6 +49,10 @@ class Block:
     def needs(self) -> str | None:
         return self.note.partition("needs:")[2].strip() or None
 
+    @property
+    def printed(self) -> bool:
+        return self.note.startswith("printed:")
+
     def command(self) -> list[str]:
         if self.language == "python":
             return [sys.executable, "-c", self.text]
@@ -64,7 +71,7 @@ def blocks(page: Path) -> Iterator[Block]:
         elif start is not None and line.strip() == "```":
             language = lines[start][3:].strip()
             note = re.fullmatch(r"<!--\s*(.*?)\s*-->", lines[start - 1].strip()) if start else None
-            if language in ("console", "python"):
+            if language in ("console", "python") or (note and note[1].startswith("printed:")):
                 yield Block(start + 1, language, note[1] if note else "", "\n".join(lines[start + 1 : number]))
             start = None
     assert start is None, f"{page}:{(start or 0) + 1}: block without an end"
@@ -98,8 +105,15 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path, request: py
     """The README's commands start as a newcomer's do, those of other pages in a process that is ready."""
     typed_in = environment() if page.name == "README.md" else request.getfixturevalue("warm")
     recordings = {path.name: path for path in (REPOSITORY.parent / "shared" / "data").rglob("*") if path.is_file()}
+    printed = list[str]()
     for block in blocks(page):
         if block.skipped:
+            continue
+        if block.printed:
+            for line in block.text.splitlines():
+                assert any(is_printed(line, other) for other in printed), (
+                    f"{page.name}:{block.line}: not printed: {line}"
+                )
             continue
         if block.needs is not None:
             if block.needs not in recordings:
@@ -117,6 +131,64 @@ def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path, request: py
         )
         where = f"{page.relative_to(REPOSITORY)}:{block.line}"
         assert done.returncode == 0, f"{where}: exit {done.returncode}\n{block.text}\n{done.stdout}\n{done.stderr}"
+        printed = done.stdout.splitlines()
+
+
+def is_printed(line: str, other: str) -> bool:
+    """Whether a line of a page is the printed one, but for numbers that differ by a twentieth of a unit or a hundredth
+    of themselves: processors round differently.
+    """
+    cut = line.endswith("...")
+    mine, theirs = NUMBER.split(line.removesuffix("...").rstrip()), NUMBER.split(other.rstrip())
+    if cut and len(theirs) >= len(mine):
+        theirs = [*theirs[: len(mine) - 1], theirs[len(mine) - 1][: len(mine[-1])]]
+    if mine[::2] != theirs[::2]:
+        return False
+    pairs = zip(map(float, mine[1::2]), map(float, theirs[1::2]), strict=True)
+    return all(abs(a - b) <= max(0.05, 0.01 * abs(a)) for a, b in pairs)
+
+
+def test_a_printed_line_is_the_same_but_for_rounding() -> None:
+    told = "landmark 62 moved by (-18.31, +1.22) m, probability > 99 % (28 hits)"
+    assert is_printed(told, told)
+    assert is_printed(told, told.replace("1.22", "1.25"))
+    assert is_printed("landmark 62 moved by (-18.31, +1.20) m, probability > 99 % ...", told)
+    for other in (told.replace("1.22", "1.29"), told.replace("moved", "turned"), told.replace("> 99", "97"), ""):
+        assert not is_printed(told, other)
+        assert not is_printed("landmark 62 moved by (-18.31, +1.22) m, probability > 99 % ...", other)
+
+
+def test_the_truth_in_the_readme_is_that_of_its_world() -> None:
+    """Of the world that its commands simulate."""
+    from evermap_studies.sim import BuildingConfig, simulate_building
+
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    world = re.search(r"evermap simulate building --days (\d+) --patrol-s (\d+) --seed (\d+)", text)
+    assert world is not None
+    days, patrol_s, seed = map(int, world.groups())
+    sessions = simulate_building(BuildingConfig(days=days, patrol_s=float(patrol_s)), seed).sessions
+    first, last = (one.true_landmarks for one in (sessions[0], sessions[-1]))
+    assert first is not None
+    assert last is not None
+    place = [dict(zip(one.landmark_id.tolist(), one.position_m, strict=True)) for one in (first, last)]
+    rows = re.findall(r"^\| (\d+), (?:a|of a) (\w+) \| (.*?) \| (.*?) \| (.*?) \|$", text, re.MULTILINE)
+    assert len(rows) == 3
+    for name, kind, *cells in rows:
+        row = first.landmark_id.tolist().index(int(name))
+        assert first.class_names[first.class_id[row]] == kind
+        was, now, by = ([float(number) for number in NUMBER.findall(cell)] for cell in cells)
+        assert was == pytest.approx(place[0][int(name)], abs=0.005)
+        if now:
+            assert now == pytest.approx(place[1][int(name)], abs=0.005)
+            told = re.search(rf"^landmark {name} moved by \((.*?), (.*?)\) \+- (.*?) m", text, re.MULTILINE)
+            assert told is not None
+            assert by[0] == pytest.approx(math.dist(was, now), abs=0.01)
+            x, y, sigma = map(float, told.groups())
+            assert by[1] == pytest.approx(math.hypot(x, y), abs=0.006)
+            assert by[1] == pytest.approx(by[0], abs=3.0 * sigma)
+        else:
+            assert int(name) not in place[1]
+            assert re.search(rf"^landmarks (\d+, )*{name}(, \d+)* vanished", text, re.MULTILINE)
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ from evermap.io.map_formats import (
     write_map,
     write_map_bytes,
 )
-from evermap.types import Landmarks
+from evermap.types import Landmarks, landmark_id_of
 
 WITH_POSES = [kind for kind in MAP_FORMATS if kind.has_poses]
 FORMATS = pytest.mark.parametrize("kind", MAP_FORMATS, ids=lambda kind: kind.name)
@@ -312,8 +312,12 @@ def test_another_file_is_called_what_it_is(content: str, match: str, tmp_path: P
 
 def test_formats_that_need_poses_say_so(tmp_path: Path) -> None:
     flat = Landmarks.at([1, 2], [[0.0, 0.0], [1.0, 1.0]])
-    named = replace(made(), names={10: "door"})
+    ids, door = made().landmark_id, landmark_id_of("door")
+    named = replace(made(), landmark_id=np.append(ids[:-1], door), names={door: "door"})
+    called = replace(made(), names={int(ids[0]): "door"})  # its number stays
     for kind in WITH_POSES:
+        write_map(called, tmp_path / "b", kind)
+        assert str(ids[0]) in (tmp_path / "b").read_text()
         with pytest.raises(InputError, match="needs a pose in space"):
             write_map(flat, tmp_path / "a", kind)
         with pytest.raises(InputError, match="door"):

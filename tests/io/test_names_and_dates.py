@@ -16,7 +16,7 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 from evermap.io import read_landmarks, write_map_geojson, write_map_parquet, write_template
 from evermap.runs.summary import change_dict
-from evermap.types import ChangeKind, Clock, MapChange, landmark_id_of
+from evermap.types import ChangeKind, Clock, MapChange, landmark_code, landmark_id_of
 
 FIVE = "2026-03-01T12:00:05Z"
 NAMES = {1: "door-3", 2: "tag:17", 3: "42"}
@@ -124,7 +124,7 @@ def test_the_same_text_is_the_same_landmark_in_the_next_session(tmp_path: Path) 
 def test_changes_say_the_names() -> None:
     change = MapChange((7, landmark_id_of("door-3")), ChangeKind.VANISHED, 0.0, 1.0, (np.nan, np.nan), 0.0, 0.9)
     assert change_dict(change)["names"] is None
-    assert change.labels == ("7", str(landmark_id_of("door-3")))
+    assert change.labels == ("7", landmark_code(landmark_id_of("door-3")))
     named = change.named({landmark_id_of("door-3"): "door-3"})
     assert named == change
     assert change_dict(named)["names"] == ["7", "door-3"]

@@ -180,8 +180,8 @@ def test_edits_are_what_operators_said() -> None:
 # --- sessions of a building, of which each sees a part ---
 
 KEYS = [
-    "landmarks", "kind", "stamp_from_s", "stamp_to_s", "displacement_m", "rotation_rad", "probability", "hits",
-    "misses", "names", "stamp_s", "decided_s",
+    "landmarks", "kind", "stamp_from_s", "stamp_to_s", "displacement_m", "displacement_covariance_m2", "rotation_rad",
+    "probability", "hits", "misses", "names", "stamp_s", "decided_s",
 ]  # fmt: skip
 QUICK = [
     "--set",

@@ -568,3 +568,27 @@ def test_the_database_library_is_loaded_by_opening_only() -> None:
     code = "import evermap.maps.store, sys; print('sqlalchemy' in sys.modules, 'numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False"]
+
+
+def test_evidence_by_revision_is_that_of_each(tmp_path: Path) -> None:
+    """Of all, of a clique, and of a landmark that belonged to another clique in each revision."""
+    first = random_map(3)
+    clique = int(first.members.clique_id[0])
+    renumbered = np.where(first.members.clique_id == clique, 99, first.members.clique_id)
+    second = replace(first, members=replace(first.members, clique_id=renumbered), n_cliques_ever=100)
+    landmark = int(first.members.landmark_id[0])
+    looks = random_evidence(1, first), random_evidence(2, first)
+    other = replace(looks[1], clique_id=np.where(looks[1].clique_id == clique, 99, looks[1].clique_id))
+    with open_store(tmp_path / "map.evermap", create=True) as store:
+        for number, (living, seen) in enumerate(((first, looks[0]), (second, other), (second, None))):
+            store.commit(living, Provenance(), (), seen, parent=number)
+        for asked in ({}, {"clique_id": clique}, {"landmark_id": landmark}, {"since_s": float(looks[0].stamp_s[9])}):
+            found = store.evidence_by_revision(**asked)
+            assert list(found) == [1, 2, 3]
+            assert len(found[3]) == 0
+            for number in (1, 2):
+                assert_same(found[number], store.evidence(**asked, revisions=[number]))
+        of_landmark = store.evidence_by_revision(landmark_id=landmark)
+        assert set(of_landmark[1].clique_id.tolist()) == {clique}
+        assert set(of_landmark[2].clique_id.tolist()) == {99}
+        assert len(store.evidence(landmark_id=landmark)) == len(of_landmark[1]) + len(of_landmark[2])

@@ -14,7 +14,8 @@ from evermap.existence.sites import Evidence
 from evermap.maps.learning import with_priors
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
-from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
+from evermap.maps.store import DamagedMapError, MapStore, Provenance, RevisionKind, open_store
+from evermap.maps.store.measured import LOOKS, pack_looks
 from evermap.maps.why import probability_text, why
 from evermap.survival import Exponential, never_leaves
 from evermap.types import ChangeKind, Clock, MapChange
@@ -53,8 +54,8 @@ def the_map(
 
 def seen(clique: int, rows: list[tuple[float, int, int, float, float, float]]) -> Evidence:
     """Stamp, hits, misses, expected, log odds, P(exists)."""
-    stamp, hits, misses, expected, said, p = (np.array(column) for column in zip(*rows, strict=True))
-    return Evidence(np.full(len(rows), clique), stamp.astype(float), hits, misses, expected, said, p)
+    stamp, hits, misses, expected, said, p = np.array(rows).reshape(-1, 6).T
+    return Evidence(np.full(len(rows), clique), stamp, hits.astype(int), misses.astype(int), expected, said, p)
 
 
 @pytest.fixture
@@ -176,3 +177,27 @@ def test_a_landmark_nobody_knows(store: MapStore) -> None:
 )
 def test_probabilities_are_never_certain(p: float, text: str) -> None:
     assert probability_text(p) == text
+
+
+def test_looks_of_sessions_that_were_entered_again_are_those_of_the_newest(store: MapStore) -> None:
+    """A late session between the first two: what they saw of body 1, which then had another number, is weighed anew."""
+    members = replace(the_map(HOUR_S, (0.5, 0.5), []).members, clique_id=np.array([1, 1, 8]))
+    renumbered = replace(members, clique_id=np.array([8, 8, 2]))
+    late = seen(1, [(0.5 * HOUR_S, 1, 1, 1.8, 2.0, 0.97)]).joined(seen(8, [(0.5 * HOUR_S, 1, 0, 0.9, 3.0, 0.9)]))
+    again = {0: (late, members), 2: (seen(8, [(HOUR_S, 1, 1, 1.7, 8.0, 0.99)]), renumbered), 3: (seen(1, []), members)}
+    data = pack_looks(again)
+    origin = Provenance(recording="monday evening", stamp_from_s=0.5 * HOUR_S)
+    store.commit(store.load(), origin, (), seen(1, []), parent=3, attachments={LOOKS: data})
+    answer = why(store, 5)
+    told = [(visit.recording, visit.n_hits, visit.n_misses, visit.p_exists) for visit in answer.visits]
+    assert told == [
+        ("monday", 3, 1, pytest.approx(0.999)),
+        ("monday evening", 1, 1, pytest.approx(0.97)),
+        ("tuesday", 1, 1, pytest.approx(0.99)),
+    ]
+    assert answer.evidence.stamp_s.tolist() == [100.0, 160.0, 0.5 * HOUR_S, HOUR_S]
+    assert [visit.recording for visit in why(store, 9).visits] == ["monday evening"]
+    assert [visit.recording for visit in why(store, 5, revision=3).visits] == ["monday", "tuesday", "friday"]
+    store.commit(store.load(), Provenance(recording="next"), (), seen(1, []), parent=4, attachments={LOOKS: data[:-9]})
+    with pytest.raises(DamagedMapError, match="the looks of revision 5 are not valid"):
+        why(store, 5)

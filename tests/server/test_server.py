@@ -260,6 +260,24 @@ def test_an_operator_edits_reverts_and_approves(fleet: Fleet, zips: list[bytes])
     assert any("/maps/ward/delete" in note["what"] for note in notes)
 
 
+def test_an_operator_calls_a_landmark_otherwise(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    one, other = fleet("GET", "/maps/ward/landmarks").json()["landmarks"][:2]
+    said = {"landmark": one["label"], "name": "by the door", "note": "as we do"}
+    assert fleet("POST", "/maps/ward/rename", "upload", json=said).status_code == 403
+    told = fleet("POST", "/maps/ward/rename", json=said).json()
+    note = f"renamed landmark {one['label']} to by the door: as we do"
+    assert told == {"site": "ward", "revision": 2, "label": "by the door", "note": note}
+    again = fleet("GET", "/maps/ward/landmarks").json()["landmarks"][0]
+    assert (again["landmark"], again["label"]) == (one["landmark"], "by the door")
+    assert fleet("GET", "/maps/ward/landmarks/by the door/why").json()["landmark"] == one["landmark"]
+    assert fleet("POST", "/maps/ward/rename", json={**said, "landmark": other["label"]}).status_code in (400, 404, 422)
+    assert [item["what"] for item in fleet("GET", "/maps/ward/diff?a=1&b=2").json()["edits"]] == [
+        f"renamed from {one['label']}"
+    ]
+
+
 def test_a_robot_is_led_to_the_approved_revision(fleet: Fleet, zips: list[bytes]) -> None:
     fleet.upload(zips[0])
     fleet.worker().step()

@@ -389,7 +389,6 @@ def _seen_from_above(now: Now) -> tuple[float, float, float]:
 def _pose(now: Now) -> dict[str, Any]:
     from evermap.types import json_number
 
-    names = [now.in_view.names.get(one, one) for one in now.in_view.landmark_id.tolist()]
     return {
         "stamp_s": json_number(now.stamp_s),
         **dict(zip(_PARTS[len(now.pose_world_robot)], map(json_number, now.pose_world_robot.tolist()), strict=True)),
@@ -397,7 +396,7 @@ def _pose(now: Now) -> dict[str, Any]:
         "frame": now.frame,
         "lost": now.lost,
         "revision": now.revision,
-        "in_view": dict(zip(map(str, names), now.in_view.p_exists.tolist(), strict=True)),
+        "in_view": dict(zip(now.in_view.labels, now.in_view.p_exists.tolist(), strict=True)),
     }
 
 

@@ -685,3 +685,33 @@ def edit(name: str) -> Callable[..., None]:
 
 for name in EDITS:
     app.command(name)(edit(name))
+
+
+@app.command("rename")
+def rename(
+    file: MapFile,
+    landmark: Annotated[str, argument("Its id, or its name.", metavar="LANDMARK")],
+    name: Annotated[str, argument("What it is called from now on; '' for its own name again.", metavar="NAME")],
+    note: _Note = "",
+    as_json: AsJson = False,
+) -> None:
+    """Call a landmark by another name, in all sessions from now on.
+
+    Its identity stays, and what it was called before still finds it.
+
+    \b
+    Example:
+      evermap map rename site.evermap "chair K381" "chair at the door"
+    """
+    from evermap.maps.store import open_store
+    from evermap.runs.sessions import rename_landmark
+
+    with open_store(file) as store:
+        parent = store.head()
+        number, called, said = rename_landmark(store, landmark, name, note=note, command=command_line())
+    if as_json:
+        print_json({"map": file, "revision": number, "parent": parent, "label": called})
+    elif number != parent:
+        say(f"revision {number}: {said}; undo with: evermap map revert {file} {parent}")
+    else:
+        say(f"nothing to do: {said}")

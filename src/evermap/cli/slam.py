@@ -650,15 +650,16 @@ def _tell_corrected(survey: Landmarks, mapped: Landmarks) -> None:
     """Say which entries of the survey that began a map its first session has put elsewhere."""
     import numpy as np
 
+    from evermap.types import rows_of
+
     _, row, at = np.intersect1d(survey.landmark_id, mapped.landmark_id, return_indices=True)
     row, at = row[mapped.n_hits[at] > 0], at[mapped.n_hits[at] > 0]
     far_m = np.linalg.norm(mapped.position_m[at] - survey.position_m[row], axis=1)
     sigma_m = np.sqrt(np.trace(mapped.covariance_m2[at] + survey.covariance_m2[row], axis1=1, axis2=2))
     moved = np.flatnonzero(far_m > np.maximum(TOLD_M, 3.0 * sigma_m))
     if len(moved):
-        names = survey.names
-        labels = [f"{names.get(k, str(k))} ({d:.2f} m)" for k, d in zip(survey.landmark_id[row[moved]].tolist(),
-                                                                       far_m[moved].tolist(), strict=True)]  # fmt: skip
+        far = zip(rows_of(survey, row[moved]).labels, far_m[moved].tolist(), strict=True)
+        labels = [f"{name} ({metres:.2f} m)" for name, metres in far]
         more = f" and {len(labels) - MOST_TOLD} more" if len(labels) > MOST_TOLD else ""
         warn(
             f"this session is not where the survey has {', '.join(labels[:MOST_TOLD])}{more}: the map follows the "

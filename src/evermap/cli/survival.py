@@ -282,7 +282,7 @@ def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) 
     counts = _counts(table, group)
     ends = f"{counts['exact']:,} observed, {counts['intervals']:,} between two looks"
     lines = [
-        ("lifetimes", f"{counts['samples']:,}"),
+        ("stays", f"{counts['samples']:,}, each of one object at one place"),
         ("their ends", f"{ends}, {counts['never_seen_gone']:,} never seen"),
         ("estimator", found.estimator),
     ]

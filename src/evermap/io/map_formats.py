@@ -75,7 +75,7 @@ from evermap.io.tag_maps import (
     wpilib_text,
 )
 from evermap.io.text import decode_text
-from evermap.types import Clock, Landmarks
+from evermap.types import Clock, Landmarks, is_number, is_text_of
 
 _Z_UP = {"up": {"direction": [0.0, 0.0, 1.0], "sigma_rad": 0.01, "source": "stated"}}
 """Of formats that say so."""
@@ -249,7 +249,8 @@ def write_map(landmarks: Landmarks, path: str | Path, kind: MapFormat) -> Path:
         if landmarks.position_m.shape[1] != 3 or not turned:
             hint = "--format csv, which needs none"
             raise InputError(f"{kind.title} needs a pose in space of every landmark", path=path, hint=hint)
-        named = [landmarks.names[k] for k in landmarks.landmark_id.tolist() if k in landmarks.names]
+        every = zip(landmarks.labels, landmarks.landmark_id.tolist(), strict=True)
+        named = [name for name, one in every if not is_number(one)]
         if named:
             hint = "--format csv, which has names"
             raise InputError(f"{kind.title} numbers its tags; this map has '{named[0]}'", path=path, hint=hint)
@@ -418,6 +419,13 @@ def _correct_parquet(file: SurveyFile, corrections: Sequence[Correction]) -> byt
     return bytes(sink.getvalue().to_pybytes())
 
 
+def _texts_of(landmarks: Landmarks) -> list[str]:
+    """Return identities (L,) by which the map is read again: texts of those that have one, else numbers."""
+    names = landmarks.names
+    every = landmarks.landmark_id.tolist()
+    return [names[one] if one in names and is_text_of(names[one], one) else str(one) for one in every]
+
+
 def _csv_of(landmarks: Landmarks) -> str:
     return csv_text(map_columns(landmarks))
 
@@ -427,9 +435,8 @@ def _parquet_of(landmarks: Landmarks) -> bytes:
 
 
 def _columns_of(landmarks: Landmarks) -> str:
-    """Ids or names, coordinates, and quaternions where there are any."""
-    names = [landmarks.names.get(k, str(k)) for k in landmarks.landmark_id.tolist()]
-    columns: dict[str, Any] = {"id": names, **dict(zip("xyz", landmarks.position_m.T, strict=False))}
+    """Ids as numbers or texts, coordinates, and quaternions where there are any."""
+    columns: dict[str, Any] = {"id": _texts_of(landmarks), **dict(zip("xyz", landmarks.position_m.T, strict=False))}
     if landmarks.rotation is not None:
         columns |= dict(zip(QUATERNION, landmarks.rotation.T, strict=True))
     return csv_text(columns)

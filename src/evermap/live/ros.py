@@ -448,8 +448,7 @@ class Teller:
                 continue
             said = np.column_stack([landmarks.position_m, landmarks.p_exists])
             self._told.update(zip(landmarks.landmark_id.tolist(), said, strict=True))
-            for one in landmarks.landmark_id.tolist():
-                self._drawn[one] = landmarks.names.get(one, str(one))
+            self._drawn.update(zip(landmarks.landmark_id.tolist(), landmarks.labels, strict=True))
             pairs = list(drawn(self._ros, landmarks, np.full(len(landmarks), now.stamp_s)))
             self._draw([marker for marker, _ in pairs], [], [entity for _, entity in pairs], now.stamp_s)
 

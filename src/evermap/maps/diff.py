@@ -73,7 +73,7 @@ class Difference(Shown):
         a, b: the revisions.
         changes: net effect of the changes reported between them.
         grown: (N,) landmarks that are present in `b` and unknown in `a`, without having appeared.
-        edits: by operators: landmark and 'pinned', 'unpinned', 'deleted' or 'undeleted'.
+        edits: by operators: landmark and 'pinned', 'unpinned', 'deleted', 'undeleted' or 'renamed from ...'.
     """
 
     a: int
@@ -113,7 +113,8 @@ def diff(store: MapStore, a: int, b: int | None = None) -> Difference:
     told, new = collect_changes(store, a, b)
     changes = tuple(change.named(names) for change in net(told, before, after, new=new))
     more = grown(before.members.landmark_id, after, changes)
-    return Difference(a, b, changes, more, edits(before.members, after.members))
+    said = sorted([*edits(before.members, after.members), *renames(before, after)])
+    return Difference(a, b, changes, more, tuple(said))
 
 
 def story_of(store: MapStore, revision: int | None = None) -> tuple[Chapter, ...]:
@@ -303,6 +304,13 @@ def edits(a: Members, b: Members) -> tuple[tuple[int, str], ...]:
     return tuple(sorted(words))
 
 
+def renames(a: LivingMap, b: LivingMap) -> tuple[tuple[int, str], ...]:
+    """Return which landmarks operators have renamed between two maps, and what they were called before."""
+    named = dict(a.renamed.items()).items() ^ dict(b.renamed.items()).items()
+    both = np.intersect1d(np.intersect1d(a.members.landmark_id, b.members.landmark_id), [one for one, _ in named])
+    return tuple((int(one), f"renamed from {a.label(int(one))}") for one in both)
+
+
 def motion_of(
     was_m: FloatArray, now_m: FloatArray, turns: tuple[FloatArray, FloatArray] | None = None
 ) -> tuple[FloatArray, float]:
@@ -394,6 +402,7 @@ def _composed(
         else:
             kind, rests_on = ChangeKind.MOVED, path
     from_s, to_s = zip(*((one.change.stamp_from_s, one.change.stamp_to_s) for one in rests_on), strict=True)
+    moved = () if goes or kind is ChangeKind.APPEARED else _spread(path, shift, maps[1].log_size_variance)
     return MapChange(
         landmark_ids=names,
         kind=kind,
@@ -404,7 +413,22 @@ def _composed(
         probability=float(np.prod([one.change.probability for one in rests_on])),
         n_hits=sum(one.change.n_hits for one in rests_on),
         n_misses=sum(one.change.n_misses for one in rests_on),
+        displacement_covariance_m2=moved,
     )
+
+
+def _spread(path: Sequence[Told], shift: FloatArray, log_size_variance: float) -> tuple[tuple[float, ...], ...]:
+    """Covariance of what the steps add up to: the sum of theirs, but that the map's metre is one for all; () where one
+    of them is not known.
+    """
+    steps = [one.change for one in path if np.isfinite(one.change.displacement_m).all()]
+    if not steps or not all(one.displacement_covariance_m2 for one in steps):
+        return ()
+    each = sum(
+        np.array(one.displacement_covariance_m2) - log_size_variance * np.outer(one.displacement_m, one.displacement_m)
+        for one in steps
+    )
+    return tuple(map(tuple, (each + log_size_variance * np.outer(shift, shift)).tolist()))
 
 
 def _shift(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: LivingMap) -> tuple[FloatArray, float]:

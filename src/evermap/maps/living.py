@@ -24,10 +24,24 @@ from evermap.config import LivingConfig
 from evermap.errors import InputError
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
+from evermap.maps.names import Renamed, given_names, landmark_with, rename
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
 from evermap.show import Shown, draw
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Tabular, Up, landmark_id_of
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    Clock,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    Tabular,
+    Up,
+    is_text_of,
+    landmark_code,
+    landmark_id_of,
+    landmark_label,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -265,7 +279,9 @@ class LivingMap(Shown):
         views: from where the robot looked, and when.
         sight: both of a large map, whose `sightlines` and `views` have no rows; None in a small one.
         class_names: names of the classes.
-        landmark_texts: texts that landmarks were called by, for those that have no number (`types.landmark_id_of`).
+        landmark_texts: identities of landmarks that are no numbers (`types.landmark_id_of`); `maps.names` says what
+            they are called.
+        renamed: what operators call landmarks.
         clock: of all stamps.
         up: where up is in the frame of a map in space, by all sessions; `landmarks().up` says it in the plane, too.
         n_cliques_ever, n_sites_ever: next free ids.
@@ -290,6 +306,7 @@ class LivingMap(Shown):
     sight: Sight | None = None
     class_names: tuple[str, ...] = ()
     landmark_texts: tuple[str, ...] = ()
+    renamed: Renamed = field(default_factory=Renamed)
     clock: Clock = Clock.RECORDING
     up: Up = field(default_factory=Up)
     n_cliques_ever: int = 0
@@ -324,7 +341,8 @@ class LivingMap(Shown):
             stays=Stays.empty(dim),
             covariance_m2=covariance,
             class_names=landmarks.class_names,
-            landmark_texts=tuple(sorted(landmarks.names.values())),
+            landmark_texts=tuple(sorted(name for one, name in landmarks.names.items() if is_text_of(name, one))),
+            renamed=Renamed.of_file({one: name for one, name in landmarks.names.items() if not is_text_of(name, one)}),
             clock=landmarks.clock,
             up=landmarks.up if dim == 3 else Up(),
             n_cliques_ever=count,
@@ -375,18 +393,33 @@ class LivingMap(Shown):
 
     @property
     def landmark_names(self) -> dict[int, str]:
-        """Texts of landmarks by their ids."""
-        return {landmark_id_of(text): text for text in self.landmark_texts}
+        """Names of landmarks that are called by more than a number, by their ids (`maps.names`)."""
+        return dict(given_names(self.landmark_texts, self.renamed))
 
     def label(self, landmark_id: int) -> str:
-        """Return what a landmark is called: its text, or its id."""
-        return self.landmark_names.get(landmark_id, str(landmark_id))
+        """Return what a landmark is called: its name, or its number."""
+        return landmark_label(landmark_id, given_names(self.landmark_texts, self.renamed))
 
     def landmark_called(self, name: str) -> int:
-        """Return the id of a landmark by its text, or by its id in digits; -1 where that is neither."""
-        if name in self.landmark_texts:
-            return landmark_id_of(name)
-        return int(name) if name.isdecimal() and len(name) <= MOST_DIGITS else -1
+        """Return the id of a landmark by what it is or was called, or by its id in digits; -1 where that is neither."""
+        found = landmark_with(name, self.landmark_texts, self.renamed)
+        if found is not None:
+            return found
+        if name.isdecimal() and len(name) <= MOST_DIGITS:
+            return int(name)
+        return next((one for one in self.members.landmark_id.tolist() if landmark_code(one) == name), -1)
+
+    def with_name(self, landmark_id: int, name: str) -> LivingMap:
+        """Return the map in which a landmark is called otherwise; '' takes an operator's name back.
+
+        Raises:
+            KeyError: no landmark has this id.
+            InputError: not a name, or that of another landmark.
+        """
+        if landmark_id not in self.members.landmark_id:
+            raise KeyError(landmark_id)
+        numbers = self.members.landmark_id.tolist()
+        return replace(self, renamed=rename(self.renamed, landmark_id, name, self.landmark_texts, numbers))
 
     def p_exists(self, at: float | None = None) -> FloatArray:
         """Return the (L,) probability that each landmark is at one of its known places.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +12,9 @@ from evermap.errors import InputError, similar
 from evermap.existence.sites import Evidence
 from evermap.maps.diff import edits, story_of
 from evermap.maps.living import EXISTS, LivingMap, Stays
-from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
+from evermap.maps.store.content import DamagedError
+from evermap.maps.store.measured import LOOKS, read_looks
+from evermap.maps.store.protocol import DamagedMapError, MapStore, Revision, RevisionKind
 from evermap.show import Shown
 from evermap.survival.durations import duration_text
 from evermap.types import UNKNOWN, Clock, MapChange, stamp_text
@@ -106,11 +109,11 @@ def why(store: MapStore, landmark: int | str, revision: int | None = None) -> An
     on_it = living.members.landmark_id[living.members.clique_id == clique]
     line = store.lineage(revision)
     log = {item.number: item for item in store.log()}
-    parts = [(number, store.evidence(landmark_id=landmark_id, revisions=[number])) for number in line]
-    evidence = Evidence.empty()
-    for _, part in parts:
-        evidence = evidence.joined(part)
-    visits = tuple(_visit(log[number], part) for number, part in parts if len(part))
+    parts = [part for part in _looks_by_session(store, line, landmark_id).items() if len(part[1])]
+    parts.sort(key=lambda part: float(part[1].stamp_s[0]))
+    evidence = Evidence.empty().joined(*(part for _, part in parts))
+    evidence = evidence[np.argsort(evidence.stamp_s, kind="stable")]
+    visits = tuple(_visit(log[number], part) for number, part in parts)
     changes = tuple(
         (one.revision, change.named(living.landmark_names))
         for one in story_of(store, revision)
@@ -138,6 +141,23 @@ def why(store: MapStore, landmark: int | str, revision: int | None = None) -> An
         reasons=(),
     )
     return _with_words(answer, living)
+
+
+def _looks_by_session(store: MapStore, line: Sequence[int], landmark_id: int) -> dict[int, Evidence]:
+    """Return the looks at a landmark's clique by the revisions of their sessions, as the newest revision counts them:
+    where a late session came in, those of it and of all after it are weighed with it in the map.
+
+    Raises:
+        DamagedMapError: they are not what was written.
+    """
+    late = {item.revision: item for item in store.attachments(line) if item.name == LOOKS}
+    found = store.evidence_by_revision(landmark_id=landmark_id, revisions=[*line])
+    for number in sorted(late):
+        try:
+            found |= read_looks(store.attached(late[number]), number, landmark_id)
+        except DamagedError as error:
+            raise DamagedMapError(str(error), path=store.where) from None
+    return found
 
 
 def _visit(revision: Revision, seen: Evidence) -> Visit:
@@ -169,7 +189,8 @@ def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tup
 
 def _with_words(answer: Answer, living: LivingMap) -> Answer:
     """Return the same with its headline and reasons."""
-    kind = f" ({answer.class_name})" if answer.class_name else ""
+    said = answer.label.startswith(answer.class_name)
+    kind = "" if said else f" ({answer.class_name})"
     what = f"landmark {answer.label}{kind}"
     belief = f"P(exists) {_belief(answer.p_exists)}"
     if answer.deleted:
@@ -181,7 +202,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
     reasons = [f"an operator {word} it in revision {number} ({when})" for number, when, word in answer.edits]
     reasons += _on_sightings(answer, living)
     if answer.companions:
-        others = ", ".join(str(name) for name in answer.companions)
+        others = ", ".join(map(living.label, answer.companions))
         word = "landmarks" if len(answer.companions) > 1 else "landmark"
         reasons.append(f"it shares a body with {word} {others}: hits and misses of all of them count")
     if answer.pinned:
@@ -292,5 +313,5 @@ def _unknown(living: LivingMap, name: str) -> str:
     if number >= 0:
         near = sorted(names[np.argsort(np.abs(names - number), kind="stable")[:3]].tolist())
         return f"no landmark {name}; the nearest ids are {', '.join(map(living.label, near))}"
-    meant = similar(name, living.landmark_texts, cutoff=0.0)
+    meant = similar(name, [*living.landmark_names.values()], cutoff=0.0)
     return f"no landmark {name!r}" + (f"; there is {meant}" if meant else "; all have numbers")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from evermap.io.landmarks import labels_of
 from evermap.io.spatial import AT
 from evermap.runs.summary import change_dict
-from evermap.types import FloatArray, json_number
+from evermap.types import FloatArray, json_number, landmark_label
 
 if TYPE_CHECKING:
     from evermap.maps.diff import Difference
@@ -52,14 +52,14 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray | None = None) -> list
     own = blocks(living.covariance_m2, living.dim)
     cliques, row_of_site = clique_rows(living.sites)
     n_sites = np.append(np.bincount(row_of_site), 0)[np.searchsorted(cliques, members.clique_id)]
-    content = []
+    names, content = living.landmark_names, []
     for row in range(len(members)):
         placed = place[row] >= 0
         at_m = living.places.position_m[place[row]].tolist() if placed else [None] * living.dim
         content.append(
             {
                 "landmark": int(members.landmark_id[row]),
-                "label": living.label(int(members.landmark_id[row])),
+                "label": landmark_label(int(members.landmark_id[row]), names),
                 "class": classes[row],
                 "clique": int(members.clique_id[row]),
                 "p_exists": float(p_exists[row]),

@@ -28,6 +28,7 @@ from evermap.types import (
     SlamResult,
     Trajectory,
     is_in_space,
+    landmark_label,
 )
 
 TOPICS = {
@@ -252,7 +253,7 @@ def _detections(ros: Ros, recording: AnyRecording) -> Iterator[_Stamped]:
                     hypothesis = ros.make("vision_msgs/ObjectHypothesis", labels[row], float(score[row]))
                     result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis, ros.spread(pose, spread[row]))
                     box = ros.make("vision_msgs/BoundingBox3D", ros.pose(pose), ros.vector(size[row]))
-                    text = "" if identity == UNKNOWN else names.get(identity, str(identity))
+                    text = "" if identity == UNKNOWN else landmark_label(identity, names)
                     found.append(ros.make("vision_msgs/Detection3D", header, [result], box, text))
             yield stamp_s, "/detections", ros.make("vision_msgs/Detection3DArray", header, found)
 
@@ -278,9 +279,10 @@ def drawn(ros: Ros, landmarks: Landmarks, stamp_s: FloatArray) -> Iterator[tuple
     nothing = np.zeros(0, dtype=np.uint8)
     file = ros.make("visualization_msgs/MeshFile", "", nothing)
     picture = ros.make("sensor_msgs/CompressedImage", ros.header(0.0, ""), "", nothing)
+    called = landmarks.labels
     for row, identity in enumerate(landmarks.landmark_id.tolist()):
         at_s, p = float(stamp_s[row]), float(landmarks.p_exists[row])
-        name, shape, here = landmarks.names.get(identity, str(identity)), ros.vector(size[row]), ros.pose(pose[row])
+        name, shape, here = called[row], ros.vector(size[row]), ros.pose(pose[row])
         turned = landmarks.rotation is not None and np.isfinite(landmarks.rotation[row]).all()
         marker = ros.make(
             "visualization_msgs/Marker", ros.header(at_s, "map"), labels[row], identity & MARKER_ID,

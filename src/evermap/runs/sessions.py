@@ -32,7 +32,15 @@ from evermap.maps.store import (
 )
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.history import STORY, Chapter, pack_story
-from evermap.maps.store.measured import RECORDING, TRAJECTORY, pack_recording, pack_trajectory, unpack_recording
+from evermap.maps.store.measured import (
+    LOOKS,
+    RECORDING,
+    TRAJECTORY,
+    pack_looks,
+    pack_recording,
+    pack_trajectory,
+    unpack_recording,
+)
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
 from evermap.types import Progress, VerdictKind, is_in_space
@@ -40,7 +48,9 @@ from evermap.valid import check_type
 
 if TYPE_CHECKING:
     from evermap.existence.lifetimes import Lifetimes
+    from evermap.existence.sites import Evidence
     from evermap.maps.lives import Life
+    from evermap.maps.living import Members
     from evermap.maps.sessions.session import Session
     from evermap.maps.store.sql import SqlStore
     from evermap.types import AnyRecording, Clock, FloatArray, IntArray, Landmarks, MapChange
@@ -252,11 +262,7 @@ def edit_landmarks(
     parent = store.head()
     before = after = store.load(parent)
     for name in landmarks:
-        try:
-            after = after.edited(after.landmark_called(name), **WORDS[word])
-        except KeyError:
-            problem = f"no landmark {name} in revision {parent}"
-            raise InputError(problem, path=store.where, hint=f"evermap map show {store.where} --all") from None
+        after = after.edited(_landmark_of(store, before, parent, name), **WORDS[word])
     changed = tuple(name for name, _ in edits(before.members, after.members))
     if not changed:
         return parent, (), f"already {word}"
@@ -264,6 +270,44 @@ def edit_landmarks(
     said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
     origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
     return store.commit(after, origin, parent=parent), changed, said
+
+
+def rename_landmark(
+    store: MapStore, landmark: str, name: str, *, note: str = "", command: str = ""
+) -> tuple[int, str, str]:
+    """Commit what an operator calls a landmark from now on, in all sessions, unless it is called so; '' takes his name
+    back. Its identity, by which it is found in recordings, stays.
+
+    Returns:
+        The newest revision, what the landmark is called in it, and what the log says.
+
+    Raises:
+        InputError: the landmark is not in the map, or it cannot be called so.
+        StaleRevisionError: another commit came in between.
+    """
+    parent = store.head()
+    before = store.load(parent)
+    identity = _landmark_of(store, before, parent, landmark)
+    after = before.with_name(identity, name)
+    was, called = before.label(identity), after.label(identity)
+    if was == called:
+        return parent, called, "it is called so already"
+    said = f"renamed landmark {was} to {called}" + (f": {note}" if note else "")
+    origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
+    return store.commit(after, origin, parent=parent), called, said
+
+
+def _landmark_of(store: MapStore, living: LivingMap, number: int, name: str) -> int:
+    """Return the id of a landmark of a revision by what it is called.
+
+    Raises:
+        InputError: it has none.
+    """
+    identity = living.landmark_called(name)
+    if identity not in living.members.landmark_id:
+        problem = f"no landmark {printable(name, 80)} in revision {number}"
+        raise InputError(problem, path=store.where, hint=f"evermap map show {store.where} --all")
+    return identity
 
 
 def _enter_late(
@@ -295,27 +339,36 @@ def _enter_late(
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
     living = _with_words(living, newest, recording.clock)
     story: list[Chapter] = []
+    looks: dict[int, tuple[Evidence, Members]] = {}
     for step in (step for step in later if step.start_s <= start_s):
-        living = _retold(store, step, living, story)
+        living = _retold(store, step, living, story, looks)
     session = run_session(recording, living, config, progress=progress)
     if not session.found:
         return Entered(session, newest, newest, (), (), head, {})
     story.append(_chapter(0, start_s, session.changes, living, session.living))
     living = session.living
+    looks[0] = session.evidence, living.members
     replayed = [step for step in later if step.start_s > start_s]
     for step in replayed:
-        living = _retold(store, step, living, story)
+        living = _retold(store, step, living, story, looks)
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
-    attached = {RECORDING: data, STORY: pack_story(parent, story)}
+    attached = {RECORDING: data, STORY: pack_story(parent, story), LOOKS: pack_looks(looks)}
     return Entered(session, newest, living, session.changes, names, head, attached)
 
 
-def _retold(store: MapStore, step: _Step, living: LivingMap, story: list[Chapter]) -> LivingMap:
-    """The map after a session or an edit that it has had before; what a session tells is added to the story."""
+def _retold(
+    store: MapStore,
+    step: _Step,
+    living: LivingMap,
+    story: list[Chapter],
+    looks: dict[int, tuple[Evidence, Members]],
+) -> LivingMap:
+    """The map after a session or an edit that it has had before; what a session tells and saw is added to both."""
     if step.recording is None:
         return _edited_again(store, step, living)
     session = _session_again(store, step, living)
     story.append(_chapter(step.revision.number, step.start_s, session.changes, living, session.living))
+    looks[step.revision.number] = session.evidence, session.living.members
     return session.living
 
 
@@ -589,7 +642,10 @@ def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
 
 
 def _with_words(living: LivingMap, newest: LivingMap, clock: Clock) -> LivingMap:
-    """An earlier map with what users said of lifetimes, which is of no time; one without places gets a clock."""
+    """An earlier map with what users said of lifetimes, and what they call landmarks, which are of no time; one without
+    places gets a clock.
+    """
+    living = replace(living, renamed=newest.renamed)
     lives = replace(living.lives, prior_class_id=newest.lives.prior_class_id, prior=newest.lives.prior)
     living = replace(living, class_names=newest.class_names, lives=lives) if len(lives.prior) else living
     return living if len(living.places) else replace(living, clock=clock)
@@ -645,7 +701,8 @@ def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequenc
         assert isinstance(old, SqlStore)
         log, start = {item.number: item for item in old.log()}, _last_revert(old)
         same = old.named(log[start].restores)[1] == fresh.named(base)[1]
-        if not same or _said(old.load()) != _said(fresh.load(fresh.head() - 1)):
+        was, newest = old.load(), fresh.load(fresh.head() - 1)
+        if not same or _said(was) != _said(newest) or [*was.renamed.items()] != [*newest.renamed.items()]:
             return 0
         kept: dict[str, dict[int, Attachment]] = {RECORDING: {}, TRAJECTORY: {}}
         for item in old.attachments():

@@ -188,6 +188,7 @@ def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: f
         "stamp_from_s": json_number(change.stamp_from_s),
         "stamp_to_s": json_number(change.stamp_to_s),
         "displacement_m": [json_number(metres) for metres in change.displacement_m],
+        "displacement_covariance_m2": [*map(list, change.displacement_covariance_m2)] or None,
         "rotation_rad": json_number(change.rotation_rad),
         "probability": json_number(change.probability),
         "hits": change.n_hits,
@@ -215,6 +216,7 @@ def change_of(content: Mapping[str, Any]) -> MapChange:
         n_hits=int(content["hits"]),
         n_misses=int(content["misses"]),
         names=tuple(content["names"] or ()),
+        displacement_covariance_m2=tuple(map(tuple, content.get("displacement_covariance_m2") or ())),
     )
 
 

@@ -37,7 +37,7 @@ from evermap.maps.store.postgres import PREFIX, SITE
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.why import why as of_landmark
 from evermap.runs import map_dicts
-from evermap.runs.sessions import WORDS, edit_landmarks
+from evermap.runs.sessions import WORDS, edit_landmarks, rename_landmark
 from evermap.runs.summary import change_dict
 from evermap.server.database import AWAY, Database, Job, JobState, Role
 from evermap.server.sites import NoSuchSiteError, SiteStores
@@ -325,6 +325,14 @@ class Said(BaseModel):
     """An operator's word on landmarks, ids or names."""
 
     landmarks: list[Annotated[str, Field(min_length=1, max_length=200)]] = Field(min_length=1, max_length=1000)
+    note: str = Field("", max_length=500)
+
+
+class Called(BaseModel):
+    """What an operator calls a landmark: its id or name, and the new name, '' for its own again."""
+
+    landmark: str = Field(min_length=1, max_length=200)
+    name: str = Field(max_length=200)
     note: str = Field("", max_length=500)
 
 
@@ -634,6 +642,17 @@ def _word(action: str, word: str) -> None:
 
 for _action, _said in zip(("pin", "unpin", "delete", "undelete"), WORDS, strict=True):
     _word(_action, _said)
+
+
+@router.post("/maps/{site}/rename")
+def rename(request: Request, site: Site, called: Called, server: Answering, who: Approver) -> dict[str, Any]:
+    """Call a landmark by another name."""
+    request.state.said = f"{called.landmark} as {called.name}"
+    with server.sites.store(site) as store:
+        number, label, told = rename_landmark(
+            store, called.landmark, called.name, note=called.note, command=f"evermap serve ({who})"
+        )
+    return {"site": site, "revision": number, "label": label, "note": told}
 
 
 @router.get("/audit")

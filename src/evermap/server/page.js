@@ -114,7 +114,7 @@ function shape(name, values, kind) {
 const percent = (p) => (p > 0.005 && p < 0.995 ? `${Math.round(100 * p)} %` : p < 0.5 ? "under 1 %" : "over 99 %");
 
 function what(change, labels) {
-  const names = change.landmarks.map((id) => labels.get(id) ?? String(id)).join(", ");
+  const names = change.landmarks.map((id, k) => labels.get(id) ?? change.names?.[k] ?? String(id)).join(", ");
   const metres = change.displacement_m.every((x) => x !== null) ? Math.hypot(...change.displacement_m) : 0;
   const degrees = Math.abs((change.rotation_rad ?? 0) * 180 / Math.PI), moves = ["moved", "rotated"].includes(change.kind);
   const turned = moves && degrees >= 17, inPlace = turned && metres < 0.1; // the limits of a living map
@@ -170,7 +170,7 @@ function paint() {
     }
     if (mark !== "mark") nodes.push(shape("circle", { cx: x, cy: y, r: 2 * size, "stroke-width": size / 2 }, "ring"));
     const title = document.createElementNS(SVG, "title");
-    title.textContent = `${one.label} ${one.class || ""} ${percent(one.p_exists)}`;
+    title.textContent = `${one.label} ${one.label.startsWith(one.class || "") ? "" : one.class} ${percent(one.p_exists)}`;
     node.append(title);
     nodes.push(node);
   }
@@ -320,6 +320,7 @@ async function why(label) {
     $("word").hidden = !operator;
     $("pins").textContent = chosen.pinned ? `Unpin ${chosen.label}` : `Pin ${chosen.label}`;
     $("deletes").textContent = chosen.deleted ? `Undelete ${chosen.label}` : `Delete ${chosen.label}`;
+    $("word-name").value = chosen.label;
     paint();
   } catch (error) { $("why").textContent = error.message; $("word").hidden = true; }
 }
@@ -329,6 +330,15 @@ async function tell(action) {
   if (await act(action, body, (answer) => `${answer.note}: revision ${answer.revision}`)) {
     $("word-note").value = "";
     await why(chosen.label);
+  }
+}
+
+async function rename() {
+  const body = { landmark: chosen.label, name: $("word-name").value, note: $("word-note").value };
+  let label = chosen.label;
+  if (await act("rename", body, (answer) => { label = answer.label; return `${answer.note}: revision ${answer.revision}`; })) {
+    $("word-note").value = "";
+    await why(label);
   }
 }
 
@@ -519,6 +529,7 @@ $("reverts").addEventListener("click", async () => {
 });
 $("pins").addEventListener("click", () => tell(chosen.pinned ? "unpin" : "pin"));
 $("deletes").addEventListener("click", () => tell(chosen.deleted ? "undelete" : "delete"));
+$("renames").addEventListener("click", rename);
 $("site").addEventListener("change", choose);
 $("before").addEventListener("input", () => {
   compares = (at("before")?.revision ?? 0) !== at("time")?.parent;

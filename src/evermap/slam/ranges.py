@@ -21,7 +21,7 @@ from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import BIAS, CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive
-from evermap.types import ANY_BEARING_RAD, UNKNOWN, BoolArray, FloatArray, Recording
+from evermap.types import ANY_BEARING_RAD, UNKNOWN, BoolArray, FloatArray, Recording, landmark_label
 
 RANGE_ONLY = "a range without a bearing is located by what is seen later, which is not causal"
 """Why a robot cannot use it while it drives."""
@@ -89,7 +89,7 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
     lost = np.setdiff1d(seen.landmark_id, landmark_id).tolist()  # others have bearings, too
     remarks = [f"{int(blind.sum())} detections without a bearing: only their ranges are used"]
     if lost:
-        called = ", ".join(recording.landmark_names.get(name, str(name)) for name in lost)
+        called = ", ".join(landmark_label(name, recording.landmark_names) for name in lost)
         remarks.append(f"landmarks that their ranges do not locate not used: {called}")
     seen = replace(seen, bearing_rad=bearing, sigma_bearing_rad=sigma, landmark_id=landmark_id)
     return replace(recording, detections=seen), tuple(remarks)

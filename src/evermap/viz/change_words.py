@@ -73,7 +73,9 @@ def _motion(change: MapChange) -> str:
     living map.
     """
     turn, shift_m = math.degrees(change.rotation_rad), math.hypot(*change.displacement_m)
-    moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}) m"
+    sigma_m = change.displacement_sigma_m
+    known = "" if math.isnan(sigma_m) else f" +- {sigma_m:.2f}"
+    moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}){known} m"
     far = abs(change.rotation_rad) >= SAME_TURN_RAD
     nowhere = all(round(metres, 2) == 0.0 for metres in change.displacement_m)
     sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis

@@ -119,7 +119,7 @@ def _draw_panel(axes: Axes, columns: View, view: MapView, reach_m: float) -> lis
     landmarks = view.landmarks
     handles = [*_draw_floor(axes, columns, view), *_draw_landmarks(axes, columns, view, reach_m)]
     if len(landmarks) <= LABELS_UP_TO:
-        names = [landmarks.names.get(name, str(name)) for name in landmarks.landmark_id.tolist()]
+        names = landmarks.labels
         label_points(axes, landmarks.position_m[:, columns], names)
     return handles
 

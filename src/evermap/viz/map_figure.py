@@ -218,8 +218,7 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
     label = draw_ellipses(axes, landmarks.position_m, landmarks.covariance_m2, colours, factor)
     axes.add_line(Line2D([], [], ls="", marker="o", mfc="none", mec=MUTED, ms=7, label=label))
     if len(landmarks) <= LABELS_UP_TO:
-        ids = landmarks.landmark_id.tolist()
-        label_points(axes, landmarks.position_m, [landmarks.names.get(name, str(name)) for name in ids])
+        label_points(axes, landmarks.position_m, landmarks.labels)
 
 
 def _draw_ways(axes: Axes, view: View, scene: _Scene, least_m: float) -> None:

@@ -358,12 +358,13 @@ def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance_m2)[:, -1], 0.0))
     oriented = errors is not None and bool(np.isfinite(errors.orientation_error_rad).any())
     rows = []
+    labels = landmarks.labels
     for i, name in enumerate(landmarks.landmark_id[:_MAX_LANDMARK_ROWS].tolist()):
         kind = int(landmarks.class_id[i])
         error_mm, nees, turn_deg = of.get(name, np.full(3, np.nan))
         rows.append(
             (
-                escape(landmarks.names.get(name, str(name))),
+                escape(labels[i]),
                 escape(landmarks.class_names[kind]) if UNKNOWN < kind < len(landmarks.class_names) else "–",
                 f"{landmarks.n_hits[i]:,}",
                 f"{landmarks.n_misses[i]:,}",

@@ -26,6 +26,7 @@ from evermap.types import (
     Landmarks,
     SlamResult,
     is_in_space,
+    landmark_label,
     rows_of,
 )
 from evermap.viz.map_figure import class_names_of, moves
@@ -245,12 +246,12 @@ class _RunScene:
         p = landmarks.p_exists[:, None]
         colours = (p * [rgb(looks[name].colour) for name in classes] + (1.0 - p) * rgb(PAPER)).astype(np.uint8)
         called = np.array([
-            landmarks.names.get(name, str(name)) + (f" ({of})" if of else "") + (f" {p:.2f}" if p < 0.995 else "")
-            for name, of, p in zip(landmarks.landmark_id.tolist(), classes, landmarks.p_exists.tolist(), strict=True)
+            name + (f" ({of})" if of else "") + (f" {p:.2f}" if p < 0.995 else "")
+            for name, of, p in zip(landmarks.labels, classes, landmarks.p_exists.tolist(), strict=True)
         ])  # fmt: skip
         order = np.argsort(first_s, kind="stable")
         for group in np.array_split(order, min(len(order), _MAX_LANDMARK_ENTITIES)):
-            names = landmarks.landmark_id[group].astype(str).tolist()
+            names = [landmark_label(one, {}) for one in landmarks.landmark_id[group].tolist()]  # a path has no spaces
             entity = f"world/landmarks/{names[0]}" + (f"_and_{len(names) - 1}_more" if len(names) > 1 else "")
             self._at(float(first_s[group].max()))
             marks = rr.Points3D(points[group], colors=colours[group], radii=0.05 * self.scale,

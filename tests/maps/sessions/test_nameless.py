@@ -19,7 +19,7 @@ from evermap.maps.sessions.nameless import held_at, without_ids
 from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
-from evermap.runs.sessions import enter_session
+from evermap.runs.sessions import enter_session, rename_landmark
 from evermap.slam.association.constellation import LocalMap
 from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, Recording, rows_of
 from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
@@ -177,8 +177,12 @@ def test_a_late_session_makes_the_map_of_the_right_order(
         for k in (0, 2, 1):
             entered = enter_session(store, one.sessions[k], NAMELESS)
             entered.commit(store, NAMELESS)
+            if k == 2:  # what an operator calls it holds in all sessions, which are entered again or not
+                first = int(store.load().members.landmark_id[0])
+                rename_landmark(store, str(first), "the first")
         late = store.load()
     assert late.landmark_texts == sessions[2].living.landmark_texts
+    assert late.landmark_names == {**sessions[2].living.landmark_names, first: "the first"}
     np.testing.assert_array_equal(late.members.landmark_id, sessions[2].living.members.landmark_id)
     np.testing.assert_array_equal(late.places.position_m, sessions[2].living.places.position_m)
 

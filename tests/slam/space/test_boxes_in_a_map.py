@@ -19,7 +19,7 @@ from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
 from evermap.pipeline import run_session
 from evermap.runs.sessions import enter_session
-from evermap.types import ChangeKind, IntArray, MapChange, SpatialRecording
+from evermap.types import ChangeKind, IntArray, MapChange, SpatialRecording, landmark_code
 from evermap_studies.worlds.parking import CAR, DAY_S, SPEED_MPS, STEP_S, VAN, Faults, Parking, Spell
 
 COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
@@ -258,7 +258,8 @@ def test_sizes_and_names_are_kept(days: Days, tmp_path: Path) -> None:
     heading = 2.0 * np.arctan2(known.rotation[:, 2], known.rotation[:, 3])  # type: ignore[index]
     off = np.remainder(heading - made.street.slot[at, 2] + 0.5 * np.pi, np.pi) - 0.5 * np.pi
     assert np.median(np.abs(off)) < 0.15
-    assert all(known.names[name].startswith("Car-") for name in names.tolist())
+    assert all(known.names[name] == f"Car {landmark_code(name)}" for name in names.tolist())
+    assert all(text.startswith("Car-") for text in third.landmark_texts)
 
 
 def test_a_drive_elsewhere_is_not_placed(days: Days) -> None:

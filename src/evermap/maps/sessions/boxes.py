@@ -25,6 +25,7 @@ from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
 from evermap.maps.bodies import squared_length
 from evermap.maps.living import LivingMap
+from evermap.maps.names import anonymous_text, distinct_text
 from evermap.maps.sessions.believe import Witnessed, aged
 from evermap.maps.sessions.box_likeness import BoxLikeness, BoxPairs, learn_likeness
 from evermap.maps.sessions.box_search import GATE, MapBoxes, in_space, placed, regained
@@ -35,7 +36,7 @@ from evermap.maps.vicinity import cliques_of
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.moving import TrafficIntake, has_traffic, rescaled, solve_in_traffic, take_in_traffic
 from evermap.slam.space.problem import PlacePrior
-from evermap.slam.space.result import identities_of, numbered
+from evermap.slam.space.result import identities_of
 from evermap.slam.space.solve import FREE, SpatialSolved
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
 
@@ -351,15 +352,13 @@ def _visit(
     seen = seen_boxes(taken, solved, settings)
     identity, names = identities_of(taken.intake, solved)
     kept = np.ones(len(identity), dtype=np.bool_)
-    start = f"{taken.recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
+    start_s = float(taken.recording.frames.stamp_s[0])
     given = set(living.landmark_texts)
     for k, place in enumerate(seen.place.tolist()):
         if matched.place[place] >= 0:
             continue
         kind = taken.recording.class_names[seen.class_id[k]] if seen.class_id[k] >= 0 else "box"
-        text, number = f"{kind}-{seen.track[k]}@{start}", 2
-        while text in given:
-            text, number = numbered(f"{kind}-{seen.track[k]}@{start}", number), number + 1
+        text = distinct_text(anonymous_text(kind, int(seen.track[k]), start_s), given)
         given.add(text)
         identity[place] = landmark_id_of(text)
         names[int(identity[place])] = text

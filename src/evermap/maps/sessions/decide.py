@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.config import DecisionConfig
-from evermap.geometry.chunked import taken
+from evermap.geometry.chunked import of_places, taken
 from evermap.maps.diff import COMES, elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
@@ -309,6 +309,7 @@ class _Session:
         """Tell the change of a clique from one site (row, -1 for none) to another."""
         away = np.full(self.entered.dim, np.nan), 0.0
         step, turn = _motion(self.entered, left, site) if site >= 0 and left >= 0 else away
+        spread = motion_covariance(self.entered, left, site) if site >= 0 and left >= 0 else ()
         there = self.entered.places.site_id == self.sites.site_id[site if site >= 0 else left]
         change = MapChange(
             landmark_ids=tuple(np.sort(self.entered.places.landmark_id[there]).tolist()),
@@ -320,6 +321,7 @@ class _Session:
             probability=float(min(max(p, 0.0), 1.0)),
             n_hits=n_hits,
             n_misses=n_misses,
+            displacement_covariance_m2=spread,
         )
         self.found.append(change)
 
@@ -397,16 +399,34 @@ def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
 
     Of none the shift is that of the middles; the rotation of fewer than two is 0.
     """
-    a = np.flatnonzero(living.places.site_id == living.sites.site_id[old])
-    b = np.flatnonzero(living.places.site_id == living.sites.site_id[new])
-    _, i, j = np.intersect1d(living.places.landmark_id[a], living.places.landmark_id[b], return_indices=True)
-    if len(i):
-        a, b = a[i], b[j]
+    a, b, are_same = _places_at(living, old, new)
     was, now = living.places.position_m[a], living.places.position_m[b]
-    if not len(i):
+    if not are_same:
         return now.mean(axis=0) - was.mean(axis=0), 0.0
     turns = (living.places.rotation[a], living.places.rotation[b]) if living.dim > 2 else None
     return motion_of(was, now, turns)
+
+
+def _places_at(living: LivingMap, old: int, new: int) -> tuple[IntArray, IntArray, bool]:
+    """Rows of the places of a body at two sites: of the landmarks that have both, if any have, else of all."""
+    a = np.flatnonzero(living.places.site_id == living.sites.site_id[old])
+    b = np.flatnonzero(living.places.site_id == living.sites.site_id[new])
+    _, i, j = np.intersect1d(living.places.landmark_id[a], living.places.landmark_id[b], return_indices=True)
+    return (a[i], b[j], True) if len(i) else (a, b, False)
+
+
+def motion_covariance(living: LivingMap, old: int, new: int) -> tuple[tuple[float, ...], ...]:
+    """Return rows of the covariance (D, D) of the shift of a body from one site (row) to another, by the joint Gaussian
+    of its places at both: what they share, such as the map's frame, cancels. The error of the map's metre is one factor
+    on the whole shift: `log_size_variance` shift shift'.
+    """
+    a, b, _ = _places_at(living, old, new)
+    rows, dim = np.concatenate([b, a]), living.dim
+    weight = np.concatenate([np.full(len(b), 1.0 / len(b)), np.full(len(a), -1.0 / len(a))])
+    joint = of_places(living.covariance_m2, rows, dim).reshape(len(rows), dim, len(rows), dim)
+    shift = weight @ living.places.position_m[rows]
+    spread = np.einsum("i,iajb,j->ab", weight, joint, weight) + living.log_size_variance * np.outer(shift, shift)
+    return tuple(map(tuple, (0.5 * (spread + spread.T)).tolist()))
 
 
 def _first_miss(looks: PlaceLooks, site: int, last_s: float, start_s: float) -> float:

@@ -27,6 +27,7 @@ from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
 from evermap.maps.bodies import log_density, squared_length
 from evermap.maps.living import EXISTS, LivingMap
+from evermap.maps.names import anonymous_text, distinct_text
 from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import TESTED_M2, windows
 from evermap.maps.sessions.gaussian import drifted
@@ -120,11 +121,11 @@ def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> Any
         DataError: too few frames with detections, or too many for the memory; in space, no odometry.
     """
     found, name, landmark_id = _met(recording, living, config)
-    start = f"{recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
-    texts: dict[int, str] = {}
-    for row in np.flatnonzero(landmark_id == UNKNOWN).tolist():  # class, number in the session, and its first stamp
+    start_s, texts = float(recording.frames.stamp_s[0]), dict[int, str]()
+    for row in np.flatnonzero(landmark_id == UNKNOWN).tolist():
         kind = int(found.of_kind[row, 0])
-        text = f"{recording.class_names[kind] if kind >= 0 else 'landmark'}-{row + 1}@{start}"
+        text = anonymous_text(recording.class_names[kind] if kind >= 0 else "", row + 1, start_s)
+        text = distinct_text(text, living.landmark_texts)
         landmark_id[row] = landmark_id_of(text)
         texts[landmark_id_of(text)] = text
     named = with_ids(recording, found.landmark_row, name, landmark_id)

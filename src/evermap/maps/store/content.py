@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
@@ -54,7 +54,7 @@ _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
           "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
           "metres.log_metre", "metres.log_variance", "metres.information", "traits.landmark_id",
-          "traits.column_id", "traits.value", "traits.sessions")  # fmt: skip
+          "traits.column_id", "traits.value", "traits.sessions", "renamed.landmark_id", "renamed.name")  # fmt: skip
 """Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -289,11 +289,22 @@ def _of_format_1(parts: dict[str, Any]) -> None:
 
 def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[str, NDArray[Any]]:
     """Return some columns of a map, such as 'members.landmark_id', without reading the rest. Errors as `unpack`."""
-    listed = _manifest(name, fetch)["columns"]
-    wanted = {column: listed.get(column) for column in columns}
-    if None in wanted.values():
+    return unpack_columns_of({name}, columns, fetch)[name]
+
+
+def unpack_columns_of(
+    names: Collection[bytes], columns: Iterable[str], fetch: Fetch
+) -> dict[bytes, dict[str, NDArray[Any]]]:
+    """Return some columns of each of several maps, by their names, with two fetches. Errors as `unpack`."""
+    columns, manifests = [*columns], fetch(names)
+    listed = {name: _manifest(name, lambda _: manifests)["columns"] for name in names}
+    if any(column not in some for some in listed.values() for column in columns):
         raise DamagedError("a column is missing")
-    return _arrays(wanted, fetch)
+    # revisions share columns, of which each is unpacked once
+    distinct = {(column, str(some[column])): some[column] for some in listed.values() for column in columns}
+    keyed = {f"{k}": value for k, value in enumerate(distinct.values())}
+    arrays = dict(zip(distinct, _arrays(keyed, fetch).values(), strict=True))
+    return {name: {column: arrays[column, str(some[column])] for column in columns} for name, some in listed.items()}
 
 
 def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
@@ -346,6 +357,8 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
             yield f"columns of different lengths in '{name}'"
     if living.sight is not None and (problem := living.sight.flaw()):
         yield problem
+    if len(living.renamed.landmark_id) != len(living.renamed.name):
+        yield "columns of different lengths in 'renamed'"
     if len(living.lives.prior_class_id) != len(living.lives.prior):
         yield "columns of different lengths in 'lives'"
     lines, places = living.sightlines, len(living.places)
@@ -366,7 +379,7 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
 
 def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
     """Sorted unique ids, references that lead somewhere."""
-    for column in ("members.landmark_id", "sites.site_id", "dated.site_id", "boxes.landmark_id"):
+    for column in ("members.landmark_id", "sites.site_id", "dated.site_id", "boxes.landmark_id", "renamed.landmark_id"):
         ids = attrgetter(column)(living)
         if np.any(ids[1:] <= ids[:-1]):
             yield f"'{column}' is not sorted, or not unique"

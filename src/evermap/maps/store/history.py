@@ -11,7 +11,8 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from itertools import chain, islice
 from typing import Any
 
 from evermap.maps.store.content import Chunk, DamagedError, Fetch, json_object, name_of, names_in, text_chunk, text_of
@@ -62,15 +63,18 @@ def pack_story(base: int, chapters: Sequence[Chapter]) -> bytes:
          one.n_grown]
         for one in chapters
     ]  # fmt: skip
-    return json.dumps({"base": base, "sessions": rows}).encode()
+    every = [change for one in chapters for change in one.changes]
+    return json.dumps({"base": base, "sessions": rows, **_spreads_of(every)}).encode()
 
 
 def read_story(data: bytes, revision: int) -> tuple[int, tuple[Chapter, ...]]:
     """Read what `pack_story` wrote for a revision; `DamagedError` if it is anything else."""
     try:
         row = json_object(data.decode())
+        read = [[*map(_change_from_list, told)] for _, _, told, _, _ in row["sessions"]]
+        every = iter(_with_spreads([*chain(*read)], row))
         chapters = tuple(
-            Chapter(number or revision, float(start_s), tuple(map(_change_from_list, told)), frozenset(new), n_grown)
+            Chapter(number or revision, float(start_s), tuple(islice(every, len(told))), frozenset(new), n_grown)
             for number, start_s, told, new, n_grown in row["sessions"]
         )
         return int(row["base"]), chapters
@@ -156,6 +160,7 @@ class Record:
                     "n_cliques_ever": self.next_ids[0],
                     "n_sites_ever": self.next_ids[1],
                     "lost": {str(number): _hex(before) for number, before in self.lost.items()},
+                    **_spreads_of(self.changes),
                 }
             )
         )
@@ -185,7 +190,7 @@ class Record:
                 content=name_of(row.get("content")),
                 config=name_of(row.get("config")),
                 evidence=_name_or_none(row.get("evidence")),
-                changes=tuple(_change_from_list(change) for change in row["changes"]),
+                changes=_with_spreads([_change_from_list(change) for change in row["changes"]], row),
                 attachments={name: (name_of(chunk), int(size)) for name, (chunk, size) in row["attachments"].items()},
                 next_ids=(row["n_cliques_ever"], row["n_sites_ever"]),
                 lost={int(number): _name_or_none(before) for number, before in row["lost"].items()},
@@ -270,6 +275,19 @@ def _change_from_list(values: Iterable[Any]) -> MapChange:
         n_hits=int(n_hits),
         n_misses=int(n_misses),
     )
+
+
+def _spreads_of(changes: Sequence[MapChange]) -> dict[str, Any]:
+    """Covariances of displacements beside the changes, where an older evermap does not look; {} without any."""
+    spreads = [one.displacement_covariance_m2 for one in changes]
+    return {"spreads": spreads} if any(spreads) else {}
+
+
+def _with_spreads(changes: Sequence[MapChange], row: Mapping[str, Any]) -> tuple[MapChange, ...]:
+    """Changes with what `_spreads_of` wrote of them."""
+    spreads = row.get("spreads", [()] * len(changes))
+    read = [tuple(tuple(float(number) for number in line) for line in spread) for spread in spreads]
+    return tuple(replace(one, displacement_covariance_m2=spread) for one, spread in zip(changes, read, strict=True))
 
 
 def _name_or_none(text: Any) -> bytes | None:

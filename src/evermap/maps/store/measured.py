@@ -10,14 +10,18 @@ import io
 import json
 import math
 import zipfile
+import zlib
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from evermap.errors import EvermapError
 from evermap.estimate.measurements import find_kinds
 from evermap.existence.sites import Evidence
 from evermap.geometry import se3
+from evermap.maps.living import Members
 from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
 from evermap.types import (
     AnyRecording,
@@ -25,6 +29,7 @@ from evermap.types import (
     Detections,
     FloatArray,
     Frames,
+    IntArray,
     Measurements,
     Odometry,
     Recording,
@@ -38,8 +43,8 @@ from evermap.types import (
     landmark_id_of,
 )
 
-RECORDING, TRAJECTORY = "recording", "trajectory"
-"""Names of the attachments."""
+RECORDING, TRAJECTORY, LOOKS = "recording", "trajectory", "looks"
+"""Names of the attachments; looks are those of a late session and of all that were brought in again after it."""
 _MOST_POSES = 200
 """Of a stored trajectory, which is for pictures."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
@@ -247,3 +252,47 @@ def _looks_to_bytes(evidence: Evidence) -> bytes:
         column = np.ascontiguousarray(getattr(evidence, name), dtype=dtype)
         planes.append(column.view(np.uint8).reshape(len(column), column.itemsize).T.tobytes())
     return b"".join(planes)
+
+
+def pack_looks(sessions: Mapping[int, tuple[Evidence, Members]]) -> bytes:
+    """Return the bytes of what sessions saw, by the revisions of their recordings (0: the one that these belong to),
+    each with the members of the cliques of its evidence.
+    """
+    looks, of_look, members = [Evidence.empty()], list[IntArray](), list[IntArray]()
+    for number, (seen, known) in sessions.items():
+        looks.append(seen)
+        of_look.append(np.full(len(seen), number))
+        mine = known[np.isin(known.clique_id, seen.clique_id)]
+        members.append(np.column_stack([np.full(len(mine), number), mine.landmark_id, mine.clique_id]))
+    every = looks[0].joined(*looks[1:])
+    columns = {name: getattr(every, name).astype(dtype) for name, dtype in _COLUMNS.items()}
+    stream = io.BytesIO()
+    np.savez_compressed(
+        stream,
+        sessions=np.array([*sessions], dtype=np.int64),
+        of_look=np.concatenate([*of_look, np.zeros(0, dtype=np.int64)]),
+        clique_id=every.clique_id,
+        members=np.concatenate([*members, np.zeros((0, 3), dtype=np.int64)]),
+        **columns,
+    )
+    return stream.getvalue()
+
+
+def read_looks(data: bytes, revision: int, landmark_id: int) -> dict[int, Evidence]:
+    """Read what `pack_looks` wrote for a revision, of the clique of one landmark: by session, empty where that saw
+    nothing of it; `DamagedError` if it is anything else.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files}
+        columns = {name: found[name].astype(np.float64 if "f" in kind else np.int64) for name, kind in _COLUMNS.items()}
+        every = Evidence(clique_id=found["clique_id"], **columns)
+        members, of_look = found["members"], found["of_look"]
+        mine = members[members[:, 1] == landmark_id]
+        sessions = {}
+        for number in found["sessions"].tolist():
+            seen = every[(of_look == number) & np.isin(every.clique_id, mine[mine[:, 0] == number, 2])]
+            sessions[number or revision] = seen[np.argsort(seen.stamp_s, kind="stable")]
+    except (ValueError, TypeError, LookupError, OSError, zipfile.BadZipFile, zlib.error, EvermapError) as error:
+        raise DamagedError(f"the looks of revision {revision} are not valid: {error}") from None
+    return sessions

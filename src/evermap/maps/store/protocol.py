@@ -250,6 +250,17 @@ class MapStore(Protocol):
         """
         ...
 
+    def evidence_by_revision(
+        self,
+        *,
+        clique_id: int | None = None,
+        landmark_id: int | None = None,
+        since_s: float = -np.inf,
+        revisions: Collection[int] | None = None,
+    ) -> dict[int, Evidence]:
+        """Return the same by the revisions that it was stored with, each by time; empty where one has none."""
+        ...
+
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
         """Return the attachments of revisions, oldest first, without reading them; None for those of `lineage()`."""
         ...

@@ -298,25 +298,44 @@ class SqlStore(Shown, MapStore):
         since_s: float = -np.inf,
         revisions: Collection[int] | None = None,
     ) -> Evidence:
-        kept = [Evidence.empty()]
+        parts = self.evidence_by_revision(
+            clique_id=clique_id, landmark_id=landmark_id, since_s=since_s, revisions=revisions
+        )
+        found = Evidence.empty().joined(*parts.values())
+        return found[np.argsort(found.stamp_s, kind="stable")]
+
+    def evidence_by_revision(
+        self,
+        *,
+        clique_id: int | None = None,
+        landmark_id: int | None = None,
+        since_s: float = -np.inf,
+        revisions: Collection[int] | None = None,
+    ) -> dict[int, Evidence]:
         with self._transaction() as connection:
-            wanted: dict[bytes, set[int | None]] = {}  # None: every clique
-            for record in self._records_of(connection, revisions):
-                clique = clique_id if landmark_id is None else self._clique_of(connection, record, landmark_id)
+            records = self._records_of(connection, revisions)
+            parts = {record.number: [Evidence.empty()] for record in records}
+            cliques = dict.fromkeys(parts, clique_id)
+            if landmark_id is not None:
+                cliques = self._cliques_of(connection, records, landmark_id)
+            wanted: dict[bytes, dict[int | None, int]] = {}  # clique, None for every one, and the first revision
+            for record in records:
+                clique = cliques[record.number]
                 mine = landmark_id is None or (clique is not None and clique_id in (None, clique))
                 if record.evidence is not None and mine:
-                    wanted.setdefault(record.evidence, set()).add(clique)
+                    wanted.setdefault(record.evidence, {}).setdefault(clique, record.number)
             rows = [
-                row
+                (wanted[name].get(row.clique_id, wanted[name].get(None, 0)), row)
                 for name, data in self._fetched(connection, wanted).items()
                 for row in read_index(content.read_text(name, data))
-                if row.last_s >= since_s and not wanted[name].isdisjoint({None, row.clique_id})
+                if row.last_s >= since_s and not wanted[name].keys().isdisjoint({None, row.clique_id})
             ]
-            stored = self._fetched(connection, {row.name for row in rows})
-            kept += [looks_of(row.clique_id, stored[row.name], row.name) for row in rows]
-        found = kept[0].joined(*kept[1:])
-        found = found[found.stamp_s >= since_s]
-        return found[np.argsort(found.stamp_s, kind="stable")]
+            stored = self._fetched(connection, {row.name for _, row in rows})
+            for number, row in rows:
+                parts[number].append(looks_of(row.clique_id, stored[row.name], row.name))
+        every = {number: some[0].joined(*some[1:]) for number, some in parts.items()}
+        every = {number: found[found.stamp_s >= since_s] for number, found in every.items()}
+        return {number: found[np.argsort(found.stamp_s, kind="stable")] for number, found in every.items()}
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
         with self._transaction() as connection:
@@ -548,11 +567,18 @@ class SqlStore(Shown, MapStore):
             self._checked = set()
         self._checked.update(names)
 
-    def _clique_of(self, connection: Connection, record: Record, landmark_id: int) -> int | None:
-        """The clique that a landmark belonged to in a revision."""
-        landmarks, cliques = self._columns(connection, record, "landmark_id", "clique_id")
-        row = np.flatnonzero(landmarks == landmark_id)
-        return int(cliques[row[0]]) if len(row) and row[0] < len(cliques) else None
+    def _cliques_of(self, connection: Connection, records: Sequence[Record], landmark_id: int) -> dict[int, int | None]:
+        """The clique that a landmark belonged to in each of some revisions; None where it was not known."""
+        names = [f"{content.MEMBERS}{name}" for name in ("landmark_id", "clique_id")]
+        every = content.unpack_columns_of(
+            {record.content for record in records}, names, partial(self._fetched, connection)
+        )
+        found: dict[int, int | None] = {}
+        for record in records:
+            landmarks, cliques = (every[record.content][name] for name in names)
+            row = np.flatnonzero(landmarks == landmark_id)
+            found[record.number] = int(cliques[row[0]]) if len(row) and row[0] < len(cliques) else None
+        return found
 
     def _columns(self, connection: Connection, record: Record, *names: str) -> list[NDArray[Any]]:
         """Columns of the landmarks of a revision, without the rest of its map."""

@@ -11,7 +11,7 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.runs.audit.drives import NEAR_M, SAME_PLACE, UNREPORTED, HeardDrive, Word
 from evermap.runs.audit.result import AuditEntry, EntryState
-from evermap.types import FloatArray, Landmarks
+from evermap.types import FloatArray, Landmarks, landmark_label
 
 DECIDED = 0.9
 """Probability from which an entry is called wrong, and its complement below which it is called right."""
@@ -37,7 +37,7 @@ def judge_entry(given: Landmarks, row: int, heard: Sequence[HeardDrive]) -> Audi
     nothing = np.full(dim, np.nan)
     sighted = [one for one in heard if name in one.words]
     blank = AuditEntry(
-        name, given.names.get(name, str(name)), EntryState.UNSEEN, math.nan, nothing, math.nan, math.nan, math.nan,
+        name, landmark_label(name, given.names), EntryState.UNSEEN, math.nan, nothing, math.nan, math.nan, math.nan,
         math.nan, math.nan, 0, sum(one.missed.get(name, 0) for one in heard), len(sighted),
         nothing, np.full((dim, dim), np.nan),
     )  # fmt: skip
@@ -265,7 +265,7 @@ def find_missing(given: Landmarks, heard: Sequence[HeardDrive]) -> list[AuditEnt
         p_there = min(1.0 - math.prod(1.0 - word.p_exists for word in said), MOST)
         if hits < FEWEST or p_there < DECIDED:
             continue
-        place, label = _place(said), names.get(name, str(name))
+        place, label = _place(said), landmark_label(name, names)
         spread = place.covariance_m2[:dim, :dim]
         twin = label.partition("#")[0] if "#" in label else ""
         reason = f"a second landmark with the number {twin}" if twin else "not in the map"
