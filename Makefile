@@ -53,7 +53,7 @@ test-slow: $(DEVELOPMENT)
 	$(PYTEST) -m "slow and not experiment" --durations=8
 
 test-all: $(DEVELOPMENT)
-	$(PYTEST) -m "slow or not slow"
+	$(PYTEST) -m "slow or not slow" --hypothesis-profile=whole
 
 experiments: $(DEVELOPMENT)
 	$(VENV)/bin/python -m pytest -m experiment
