@@ -12,7 +12,7 @@ VENV ?= .venv
 OUT ?= out/demo
 # Tests run in this many processes, up to six: one a core, and one more, since tests of servers and of live wires wait an
 # eighth of the time. One that is done takes tests from the others. Each begins with its own part of the folders, so that
-# hardly a kernel is compiled twice. Matrices are small: more threads of BLAS than cores only wait for each other.
+# few wait for a kernel that another one compiles. Matrices are small: more threads of BLAS than cores only wait.
 # Bytecode is kept even where the environment switches it off, as images of Python do: without it every process would
 # compile our modules and rewrite the assertions of all tests again.
 PROCESSES ?= $(shell n=$$(($$(nproc 2>/dev/null || echo 2) + 1)); echo $$((n > 6 ? 6 : n)))
@@ -53,7 +53,7 @@ test-slow: $(DEVELOPMENT)
 	$(PYTEST) -m "slow and not experiment" --durations=8
 
 test-all: $(DEVELOPMENT)
-	$(PYTEST) -m "slow or not slow"
+	$(PYTEST) -m "slow or not slow" --hypothesis-profile=whole
 
 experiments: $(DEVELOPMENT)
 	$(VENV)/bin/python -m pytest -m experiment

@@ -13,9 +13,11 @@ import pytest
 import typer.testing
 from hypothesis import settings
 
-# an example may take as long as it takes: a slow machine, or a kernel that is compiled first, is no failure
-settings.register_profile("no clock", deadline=None)
-settings.load_profile("no clock")
+# an example may take as long as it takes: a slow machine, or a kernel that is compiled first, is no failure; all tests,
+# the slow ones too, try four times as many
+settings.register_profile("quick", deadline=None, max_examples=50)
+settings.register_profile("whole", deadline=None, max_examples=200)
+settings.load_profile("quick")
 
 # a process builds its command line once; CliRunner would do it again for each of a thousand commands
 setattr(typer.testing, "_get_command", functools.cache(typer.testing._get_command))  # noqa: B010

@@ -68,6 +68,60 @@ def test_two_that_compile_at_the_same_moment_keep_the_code_of_both(
     assert len(later.stats.cache_hits) == 2
 
 
+AT_ONCE = """
+import os, sys, time
+from pathlib import Path
+
+from evermap.compiled import kept
+
+
+@kept()
+def below(value):
+    return value + 1.0
+
+
+@kept()
+def above(value):
+    return below(value) + 1.0
+
+
+def slowly(kernel, for_s):
+    compile_kernel = kernel._compiler.compile
+
+    def compile_slowly(*given):
+        Path("compiled", f"{kernel.__name__} {os.getpid()}").touch()
+        time.sleep(for_s)
+        return compile_kernel(*given)
+
+    kernel._compiler.compile = compile_slowly
+
+
+slowly(below, 0.5)
+slowly(above, 0.0)
+Path(f"ready {os.getpid()}").touch()
+while len(list(Path().glob("ready *"))) < 2:
+    time.sleep(0.001)
+print((above, below)[sys.argv[1] == "below"](1.0))
+"""
+
+
+@pytest.mark.parametrize(("other", "result"), [("above", "3.0"), ("below", "2.0")])
+def test_of_processes_that_need_the_same_code_one_compiles_it(tmp_path: Path, other: str, result: str) -> None:
+    """Also where one needs it for a kernel that calls it."""
+    (tmp_path / "at_once.py").write_text(AT_ONCE)
+    (tmp_path / "compiled").mkdir()
+    path = os.pathsep.join([str(tmp_path), str(SOURCES)])
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", "import at_once", which], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+            stdout=subprocess.PIPE, text=True,
+        )
+        for which in ("above", other)
+    ]  # fmt: skip
+    assert [process.communicate(timeout=100)[0].strip() for process in processes] == ["3.0", result]
+    assert sorted(file.name.partition(" ")[0] for file in tmp_path.glob("compiled/*")) == ["above", "below"]
+
+
 CALLED = """
 from evermap.compiled import kept
 

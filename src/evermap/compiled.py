@@ -146,13 +146,13 @@ def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]
         dispatcher._cache = _keeper()(function)
         dispatcher._cache.of = dispatcher
         dispatcher.effort = effort
-        dispatcher.compile = _whole(dispatcher.compile, effort)
+        dispatcher.compile = _whole(dispatcher.compile, effort, dispatcher._cache)
         return cast("_Function", dispatcher)
 
     return decorate
 
 
-def _whole(compile_for: Callable[..., Any], effort: int) -> Callable[..., Any]:
+def _whole(compile_for: Callable[..., Any], effort: int, cache: Any) -> Callable[..., Any]:
     """Compiling that no `KeyboardInterrupt` cuts in two, at an effort of its own.
 
     LLVM asks for kept machine code, and hands over the new, through callbacks of ctypes. These drop an exception: the
@@ -160,7 +160,7 @@ def _whole(compile_for: Callable[..., Any], effort: int) -> Callable[..., Any]:
     """
 
     def compile_whole(signature: Any) -> Any:
-        with held() if raises() else contextlib.nullcontext(), _optimising(effort):
+        with held() if raises() else contextlib.nullcontext(), _optimising(effort), cache.turns():
             return compile_for(signature)
 
     return compile_whole
@@ -203,6 +203,7 @@ def _keeper() -> Callable[[Any], Any]:
     Its own reads the index of what is kept, chooses a file and writes both, without a lock. Of processes that compile
     a function for different arguments at the same moment, one could be given the machine code of the other's. And it
     compares kept code with the file of the function only, though that holds the code of all that the function calls.
+    Of processes that need the same code, one compiles it, and the others wait and load it.
     """
     from numba import config
     from numba.core.caching import CompileResultCacheImpl, FunctionCache
@@ -216,18 +217,38 @@ def _keeper() -> Callable[[Any], Any]:
         _impl_class = NamedWithoutLine
         of: Any = None
         """The dispatcher whose code is cached."""
+        turn: contextlib.ExitStack | None = None
+        """Within a compilation, what keeps other processes from the same one until it ends."""
+
+        @contextlib.contextmanager
+        def turns(self) -> Iterator[None]:
+            """Within the block, code that is missing is compiled by this process alone, or loaded if another was."""
+            before = self.turn
+            with contextlib.ExitStack() as turn:
+                self.turn = turn
+                try:
+                    yield
+                finally:
+                    self.turn = before
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
+            found = self._load(sig, target_context)
+            while found is None and _AT_FIRST_MISSING:
+                _AT_FIRST_MISSING.pop()()
+            if found is None and self.turn is not None:
+                name = hashlib.sha256(str(sig).encode()).hexdigest()[:8]
+                self.turn.enter_context(_locked(Path(self.cache_path), f"{self._impl.filename_base}.{name}"))
+                found = self._load(sig, target_context)
+            return found
+
+        def _load(self, sig: Any, target_context: Any) -> Any:
             with _locked(Path(self.cache_path)):
                 self._stamp()
                 try:
-                    found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                    return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
                 except UNREADABLE:
                     self.flush()  # type: ignore[no-untyped-call]
-                    found = None
-            while found is None and _AT_FIRST_MISSING:
-                _AT_FIRST_MISSING.pop()()
-            return found
+                    return None
 
         def save_overload(self, sig: Any, data: Any) -> None:
             with _locked(Path(self.cache_path)):
@@ -283,16 +304,19 @@ def temporary_folder() -> str:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _locked(folder: Path, name: str = "machine-code") -> Iterator[None]:
     try:
         import fcntl
     except ImportError:  # Windows has no such lock: processes there do as numba alone has them do
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "machine-code.lock").open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
-        yield
+    with (folder / f"{name}.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            fcntl.flock(file, fcntl.LOCK_UN)  # closing it does not where a fork has it open, too
 
 
 @functools.cache

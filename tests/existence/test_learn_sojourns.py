@@ -334,7 +334,7 @@ def test_shares_of_days_are_learned_and_later_days_are_added() -> None:
 
 def test_learning_goes_on_from_a_model_of_most_of_the_looks() -> None:
     """As good as anew, with nothing else tried: no family that lost before, no typical duration from the start."""
-    time, there = truth(Weibull(2.5, 60.0), LogNormal(3.5, 0.4), 7)
+    time, there = truth(Weibull(2.5, 60.0), LogNormal(3.5, 0.4), 7, features=3)
     looks = looks_at(time, there, seed=7)
     before = learn(looks.taken(looks.stamp_s < 1e6 + 0.8 * SPAN_S))
     on, anew = learn(looks, start=before.model), learn(looks)

@@ -152,9 +152,8 @@ class World:
                     FOCAL if corners else None, resolution_px=(1280, 800) if corners else None, range_max_m=8.0,
                 )
             )  # fmt: skip
-            for row in range(len(robot)):
-                eye, eye_at = turn[row] * mount, at[row] + turn[row].apply([x, y, z])
-                parts.append(self._seen(random, number, row, eye, eye_at, corners=corners))
+            eye, eye_at = turn * mount, at + turn.apply([x, y, z])
+            parts += self._seen(random, number, eye, eye_at, corners=corners)
         order = sorted((part for part in parts if len(part[2])), key=lambda part: part[1])
         frame = np.concatenate([np.full(len(part[2]), part[1]) for part in order])
         sensor = np.concatenate([np.full(len(part[2]), part[0]) for part in order])
@@ -182,30 +181,37 @@ class World:
         )  # fmt: skip
 
     def _seen(
-        self, random: np.random.Generator, number: int, row: int, eye: Rotation, at: np.ndarray, *, corners: bool
-    ) -> tuple[int, int, np.ndarray, np.ndarray]:
-        names, read = [], []
-        for name, (place, tag, factor) in enumerate(zip(self.where, self.turned(), self.factors(), strict=True)):
-            own = eye.inv().apply(place - at)
-            facing = (eye.inv() * tag).apply([0.0, 0.0, 1.0])
-            if own[2] < 0.5 or np.linalg.norm(own) > 6.0 or facing @ own > -0.3 * np.linalg.norm(own):
-                continue
-            corner = eye.inv().apply(place + tag.apply(CORNERS * SIZE_M * factor) - at)
-            fx, fy, cx, cy = FOCAL
-            flat = corner[:, :2] / corner[:, 2:]
-            far2 = (flat**2).sum(axis=1, keepdims=True)
-            pixel = flat * (1.0 + self.bent * far2 + 0.8 * self.bent**2 * far2**2) * [fx, fy] + [cx, cy]
-            if (pixel < 0.0).any() or (pixel > [1280.0, 800.0]).any() or random.random() > 0.9:
-                continue
-            names.append(name)
-            if corners:
-                read.append(pixel + random.normal(0.0, 0.5, (4, 2)))
-            else:
-                far = np.linalg.norm(own)
-                noisy = own / factor + random.normal(size=3) * 0.006 * far
-                rough = (eye.inv() * tag) * Rotation.from_rotvec(random.normal(0.0, 0.03, 3))
-                read.append(np.concatenate([noisy, rough.as_quat()]))
-        return number, row, np.array(names, dtype=np.int64), np.array(read)
+        self, random: np.random.Generator, number: int, eye: Rotation, at: np.ndarray, *, corners: bool
+    ) -> list[tuple[int, int, np.ndarray, np.ndarray]]:
+        """What one camera reads in each frame: its number, the frame, names, and what is read of each."""
+        place, tag, factor, away = self.where, self.turned(), self.factors(), eye.inv()
+        corner_m = place[:, None] + np.stack([one.apply(CORNERS * SIZE_M) for one in tag]) * factor[:, None, None]
+        out, turn = tag.apply([0.0, 0.0, 1.0]), away.as_matrix()
+        own = np.einsum("fij,ftj->fti", turn, place - at[:, None])
+        facing = np.einsum("fij,tj->fti", turn, out)
+        corner = np.einsum("fij,ftcj->ftci", turn, corner_m - at[:, None, None])
+        far_m = np.linalg.norm(own, axis=2)
+        fx, fy, cx, cy = FOCAL
+        flat = corner[..., :2] / corner[..., 2:]
+        far2 = (flat**2).sum(axis=-1, keepdims=True)
+        pixel = flat * (1.0 + self.bent * far2 + 0.8 * self.bent**2 * far2**2) * [fx, fy] + [cx, cy]
+        inside = ((pixel >= 0.0) & (pixel <= [1280.0, 800.0])).all(axis=(2, 3))
+        shown = inside & (own[..., 2] >= 0.5) & (far_m <= 6.0) & ((facing * own).sum(axis=2) <= -0.3 * far_m)
+        parts = []
+        for row, visible in enumerate(shown):
+            names, read = [], []
+            for name in np.flatnonzero(visible):
+                if random.random() > 0.9:
+                    continue
+                names.append(name)
+                if corners:
+                    read.append(pixel[row, name] + random.normal(0.0, 0.5, (4, 2)))
+                else:
+                    noisy = own[row, name] / factor[name] + random.normal(size=3) * 0.006 * far_m[row, name]
+                    rough = (away[row] * tag[name]) * Rotation.from_rotvec(random.normal(0.0, 0.03, 3))
+                    read.append(np.concatenate([noisy, rough.as_quat()]))
+            parts.append((number, row, np.array(names, dtype=np.int64), np.array(read)))
+        return parts
 
     def turned(self) -> Rotation:
         """Tags that hang upright and look into the field: z out of the wall, y down."""

@@ -96,7 +96,7 @@ def exchanged(tags: Landmarks, one: int, other: int) -> Landmarks:
     return replace(tags, position_m=tags.position_m[order], rotation=tags.rotation[order])
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_a_right_map_is_called_right_and_stays_as_it_is(seed: int, tmp_path: Path) -> None:
     world = corridor(seed)
     file = as_file(surveyed(world), tmp_path / "field.json")
@@ -224,7 +224,7 @@ def poles(recording: Recording, seed: int) -> Landmarks:
     return Landmarks.at(true.landmark_id, true.position_m + noise, sigma_m=0.01, frame="prior_map")
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_in_the_plane(seed: int, tmp_path: Path) -> None:
     """One pole moved by .3 m, two labels exchanged, one pole cut down; as a table of somebody's."""
     recording = hall(seed)

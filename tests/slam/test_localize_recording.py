@@ -63,7 +63,7 @@ def rmse(error_m: np.ndarray) -> float:
     return float(np.sqrt((error_m[:, :2] ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_what_is_known_at_the_time_is_nearly_as_good_as_with_a_map_that_is_learned(seed):
     """The whole session's estimator, with the same map, has learned the noise and relinearised all poses by then."""
     recording = building(seed, patrol_s=90.0, faults=0.01).sessions[0]
@@ -217,7 +217,7 @@ def test_real_robots_among_surveyed_barrels(robot, shared_data):
     assert 1.0 < nees.mean() < 6.0
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_landmarks_that_the_map_lacks_hold_the_pose_where_they_were_seen_first(seed):
     """In a map of half a building; in a map of all of it they change nothing."""
     recording = building(seed, patrol_s=120.0, faults=0.01).sessions[0]

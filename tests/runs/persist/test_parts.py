@@ -51,16 +51,16 @@ def write(table: dict[str, Any], path: Path, files: int = 1) -> Path:
     return path
 
 
-def run(path: Path, out: Path, *more: str) -> Result:
-    return CliRunner().invoke(app, ["persist", str(path), "--out", str(out), "--figures", "2", *more])
+def run(path: Path, out: Path, *more: str, figures: int = 0) -> Result:
+    return CliRunner().invoke(app, ["persist", str(path), "--out", str(out), "--figures", str(figures), *more])
 
 
-def same(path: Path, folder: Path, *more: str, rows: int = 300) -> dict[str, Any]:
+def same(path: Path, folder: Path, *more: str, rows: int = 300, figures: int = 0) -> dict[str, Any]:
     """Run in one piece and in parts; every file must be the same, byte by byte; returns the summary."""
     names = (*FILES, "model.json") if "--recurrent" in more else FILES
     for out, at_once in (("one", 10**6), ("parts", rows)):
         assert is_parted(path, at_once) == (out == "parts")
-        result = run(path, folder / out, *more, "--set", f"persist.rows_at_once={at_once}")
+        result = run(path, folder / out, *more, "--set", f"persist.rows_at_once={at_once}", figures=figures)
         assert result.exit_code == 0, result.output
     for name in names:
         assert (folder / "one" / name).read_bytes() == (folder / "parts" / name).read_bytes(), name
@@ -80,7 +80,7 @@ def same(path: Path, folder: Path, *more: str, rows: int = 300) -> dict[str, Any
 
 @pytest.mark.parametrize("query", ["times", "grid"])
 def test_in_parts_the_files_are_those_of_one_piece(tmp_path: Path, query: str) -> None:
-    told = same(write(looks(), tmp_path / "looks.parquet"), tmp_path, "--query", query)
+    told = same(write(looks(), tmp_path / "looks.parquet"), tmp_path, "--query", query, figures=2)
     assert told["counts"]["rows"] == 4000
     assert told["counts"]["vanished"] > 70
     assert any("returned" in remark for remark in told["warnings"])

@@ -70,7 +70,7 @@ def test_a_small_world_is_sorted_out(seed: int) -> None:
     assert np.mean(row == NOBODY) < 0.02
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_noise_of_the_odometry_is_learned_from_far_too_much(seed: int) -> None:
     made = make_world(seed, n_poses=400, n_landmarks=8, prior=KNOWN_SENSORS)
     associator = PlanarAssociator(

@@ -210,7 +210,7 @@ def first_session(seed: int) -> tuple[SpatialRecording, Session]:
     return first, run_session(first, None, NAMELESS)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_points_keep_their_names_over_sessions_and_those_that_left_are_told(seed):
     whole, gone = hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05), [3, 20, 41]
     first, begun = first_session(seed)

@@ -45,7 +45,7 @@ def improvement(recording: SpatialRecording) -> float:
     return float(found.poses.rmse_m / found.dead_reckoning.rmse_m)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_drift_is_what_landmarks_share(seed: int) -> None:
     """It is not taken for errors of the detector, whose white noise lets the robot be located."""
     recording = Room.of(seed).walk(seed, drift=0.02)
@@ -56,7 +56,7 @@ def test_drift_is_what_landmarks_share(seed: int) -> None:
     assert improvement(recording) < 0.25
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_errors_that_last_are_found_and_do_not_pull_a_good_odometry_away(seed: int) -> None:
     recording = lasting(Room.of(seed).walk(seed, drift=0.002), 0.06, 5.0)
     intake = prepare_space(recording, Config().slam.space)
