@@ -94,3 +94,18 @@ def test_a_state_costs_how_unusual_it_is_and_how_well_it_is_known() -> None:
     before = trial(7.0, Taken(one, 0.6))
     after = competition._with_last(before, Taken(one, 0.6, 100.0 / 0.3**2))
     assert after.evidence == pytest.approx(7.0 - math.log(10.0))
+
+
+def test_a_cause_names_what_explains_the_same_without_it() -> None:
+    nothing = SimpleNamespace(parameters=())
+    size, wheels = (Taken(suspect(code, code), 0.05) for code in ("tag-size", "odometry-scale"))
+    base, best = trial(-50.0, result=nothing), trial(0.0, size, result=nothing)
+    other, both = trial(-1.0, wheels, result=nothing), trial(-0.5, size, wheels, result=nothing)
+    (found,) = competition._causes(best, [base, best, other], base)
+    assert found.probability == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))
+    assert found.instead == str(wheels.state)
+    assert other.beats(best) == pytest.approx(-1.0)  # the same price
+    assert competition._causes(best, [base, best], base)[0].instead == ""  # nothing is off
+    assert competition._causes(best, [best, both], None)[0].instead == ""
+    by_code = {one.code: one.instead for one in competition._causes(both, [base, best, other, both], base)}
+    assert by_code == {"tag-size": str(wheels.state), "odometry-scale": str(size.state)}

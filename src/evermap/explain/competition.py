@@ -958,6 +958,11 @@ def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     return state, sigma
 
 
+def _say(trial: Trial[VisitT]) -> str:
+    """Return the causes of a trial in words."""
+    return "; ".join(one.suspect.say(_with_own_state(one, trial.solution.result)[0]) for one in trial.taken)
+
+
 def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[VisitT] | None) -> tuple[Cause, ...]:
     """Return the causes of the best trial, with their probabilities among all that was weighed."""
     if not best.taken:
@@ -969,7 +974,8 @@ def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[Visit
     gained = math.nan if base is None else best.beats(base)
     for one in best.taken:
         name = one.suspect.code, one.suspect.subject
-        holds = [any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed]
+        holds = np.array([any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed])
+        other = None if holds.all() else weighed[int(np.argmax(np.where(holds, -math.inf, relative)))]
         suspect = one.suspect
         state, sigma = _with_own_state(one, best.solution.result)
         value = suspect.shown(state) if suspect.is_continuous else math.nan
@@ -977,7 +983,7 @@ def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[Visit
         found.append(
             Cause(
                 suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
-                float(share[np.array(holds)].sum()), suspect.fix(state), gained,
+                float(share[holds].sum()), suspect.fix(state), gained, "" if other is None else _say(other),
             )
         )  # fmt: skip
     return tuple(sorted(found, key=lambda cause: -cause.probability))
