@@ -95,8 +95,9 @@ FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
 AXES_OF_TAGS = frozenset({"map-axes", "corner-order"})
 """Causes of a map by which only the orientations of its tags are others: its shape says which may be."""
-LEAST_LATE_S = 0.02
-"""Delay of the sensor's stamps from which poses are put where the robot was when detections were taken."""
+LEAST_LATE_S, LONGEST_LEAD_S = 0.02, 1.0
+"""Delay of the sensor's stamps from which poses are put where the robot was when detections were taken; and by how much
+commands are stamped before the robot follows them, at most."""
 CLOCK = "clock"
 """Cause of stamps that are late."""
 CHANGES, INNOVATIONS = "changes", "innovations"
@@ -319,12 +320,16 @@ def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
     """Return by how much stamps of the sensor are late, where measured motions in the plane seem early.
 
     Nothing stamps a motion before it was, so what is late are the detections: at their stamps the robot is not where
-    it was when they were taken. In space delays are those of the sensors.
+    it was when they were taken. Commands are stamped before, but no robot follows them so late as `LONGEST_LEAD_S`. In
+    space delays are those of the sensors.
     """
-    if is_in_space(inputs.recording) or not inputs.recording.odometry.is_measured:
+    if is_in_space(inputs.recording):
         return None
-    delay = find_odometry_delay(result)
-    if delay is None or not (delay.p_needed > SURE and -delay.value > max(LEAST_LATE_S, SURELY * delay.sigma)):
+    delay, least_s = (
+        find_odometry_delay(result),
+        LEAST_LATE_S if inputs.recording.odometry.is_measured else LONGEST_LEAD_S,
+    )
+    if delay is None or not (delay.p_needed > SURE and -delay.value > max(least_s, SURELY * delay.sigma)):
         return None
     suspect = next(one for one in list_suspects(inputs, calibrations=True) if one.code == CLOCK)
     return Taken(suspect, -delay.value, delay.sigma**-2)
