@@ -458,8 +458,8 @@ def _next_cause(
     def ahead(trial: Trial[VisitT]) -> float:
         return trial.evidence if best is None else trial.beats(best)
 
-    for screen in screens:
-        asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
+    for ranked in _rank(best, inputs, suspects, config, screens):
+        asked = _diverse(ranked, rules.most_tried, tried)
         made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
         trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
         for row, trial in enumerate(trials[:REFINED]):
@@ -474,6 +474,48 @@ def _next_cause(
         if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
             return winner
     return winner
+
+
+def _rank(
+    best: Trial[VisitT] | None,
+    inputs: Inputs,
+    suspects: list[Suspect],
+    config: SlamConfig,
+    screens: Sequence[Callable[..., Asked]],
+) -> Iterable[Asked]:
+    """Yield causes to solve for in turns, as each of the `screens` lets them through, the first what shows without a
+    solution, and before that the one that leads; there is no need for the next turn where one explains all.
+    """
+    shown, *others = (partial(screen, best, inputs, suspects, config) for screen in screens)
+    plain = shown()
+    if best is None or not others or not all(_is_near(one, state) for _, one, state in plain):
+        yield plain
+        for screen in others:
+            yield screen()
+        return
+    linear = others[0]()
+    yield _find_leader(plain, linear, config.explain.lead_nats)
+    yield plain
+    yield linear
+
+
+def _find_leader(shown: Asked, found: Asked, least: float) -> Asked:
+    """Return the cause by whose linear gain no other can win, if there is one and the linear test reaches it.
+
+    Args:
+        shown: causes that show without a solution, none of which are discrete: of these the state that shows is tried.
+        found: causes by their linear gain, the largest first.
+        least: gain from which a cause is among them [nats].
+    """
+    known = {(one.code, one.subject) for _, one, _ in shown}
+    first = [(gain, one, state) for gain, one, state in found[:1] if (one.code, one.subject) not in known]
+    others = max([least, *(gain for gain, _, _ in found[1:])])
+    return [(gain, one, state) for gain, one, state in first if gain > LINEAR * others and _is_near(one, state)]
+
+
+def _is_near(suspect: Suspect, state: float) -> bool:
+    """Return whether a cause is continuous and a state within what is tried of it at once."""
+    return suspect.is_continuous and abs(state) < FAR * suspect.sigma
 
 
 def _is_metre_known(inputs: Inputs) -> bool:
