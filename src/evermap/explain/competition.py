@@ -514,8 +514,8 @@ def _find_leader(shown: Asked, found: Asked, least: float) -> Asked:
 
 
 def _is_near(suspect: Suspect, state: float) -> bool:
-    """Return whether a cause is continuous and a state within what is tried of it at once."""
-    return suspect.is_continuous and abs(state) < FAR * suspect.sigma
+    """Return whether a state is within what is tried of a cause at once; False of discrete ones, which have none."""
+    return abs(state) < FAR * suspect.sigma
 
 
 def _is_metre_known(inputs: Inputs) -> bool:
