@@ -50,7 +50,7 @@ DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 LONGEST_S, SMALL_LONGEST_S = 240, 8
 """CPU time of a run, and of one in a small world; a lost one may search for long."""
 WORSE, SLACK_M, MOST_NEES = 1.05, 0.01, 4.0
-FRESH = 5000
+FRESH = 7000
 """Seed from which worlds take no part in setting limits."""
 SPLIT = 1000
 """Seeds between the beginnings of splits: a world has as many of each kind in any of them."""

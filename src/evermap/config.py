@@ -580,7 +580,11 @@ class SpaceConfig(Section):
         0.0, "standard deviation of the mounts' orientations [rad]; 0: exactly as stated", ge=0, le=3
     )
     scale_sigma: float = key(
-        0.005, "standard deviation of the odometry's scale, where tags of known sizes tell it; 0: exact", ge=0, le=1
+        0.005,
+        "standard deviation of the odometry's scale, where tags of known sizes tell it, or nothing does (directions); "
+        "0: exact",
+        ge=0,
+        le=1,
     )
     delay_sigma_s: float = key(
         0.3, "standard deviation of the delay of the sensors' stamps [s]; 0: no delay", ge=0, le=10

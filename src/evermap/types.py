@@ -1060,6 +1060,7 @@ class Cause(Shown):
         probability: among all that was weighed.
         fix: the line of `sensor.toml`, or the option, that mends it; '' where there is none.
         nats: by how much it raises the log evidence of the recording, its price paid.
+        instead: messages of the most probable explanation without it; '' where that is nothing.
     """
 
     code: str
@@ -1070,6 +1071,7 @@ class Cause(Shown):
     probability: float = math.nan
     fix: str = ""
     nats: float = math.nan
+    instead: str = ""
 
 
 @dataclass(frozen=True, slots=True)

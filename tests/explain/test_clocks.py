@@ -141,6 +141,19 @@ def test_velocities_may_be_commands_which_are_early() -> None:
     assert result.trajectory.stamp_s[0] == commanded.frames.stamp_s[0]
 
 
+def test_no_robot_follows_its_commands_a_second_late() -> None:
+    """The clock is told all the same: what is so far off is not as stated."""
+    right, late = record(0.0, is_measured=False), record(1.3, is_measured=False)
+    result = run_slam(late)
+    assert error_m(result, late) < 1.5 * error_m(run_slam(right), right) + 0.002
+    assert [(one.code, one.subject) for one in result.causes] == [("clock", "sensor")]
+    assert result.causes[0].value == pytest.approx(1.3, abs=0.02)
+    assert result.verdict is not None
+    assert result.verdict.kind == "sensor suspect"
+    slow = record(0.8, is_measured=False)
+    assert [(one.code, one.subject) for one in run_slam(slow).causes] != [("clock", "sensor")]
+
+
 def test_an_odometry_that_is_late_is_no_sensor_that_is_early() -> None:
     recording = record(-0.12)
     result = run_slam(recording)

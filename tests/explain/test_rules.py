@@ -11,7 +11,7 @@ import pytest
 from evermap.config import SlamConfig
 from evermap.explain import competition
 from evermap.explain.causes import Suspect
-from evermap.explain.competition import Taken, Trial
+from evermap.explain.competition import FAR, Taken, Trial
 
 
 def suspect(code: str = "tag-size", subject: str = "5", sigma: float = 0.3, p: float = 0.01) -> Suspect:
@@ -94,3 +94,45 @@ def test_a_state_costs_how_unusual_it_is_and_how_well_it_is_known() -> None:
     before = trial(7.0, Taken(one, 0.6))
     after = competition._with_last(before, Taken(one, 0.6, 100.0 / 0.3**2))
     assert after.evidence == pytest.approx(7.0 - math.log(10.0))
+
+
+def test_a_cause_names_what_explains_the_same_without_it() -> None:
+    nothing = SimpleNamespace(parameters=())
+    size, wheels = (Taken(suspect(code, code), 0.05) for code in ("tag-size", "odometry-scale"))
+    base, best = trial(-50.0, result=nothing), trial(0.0, size, result=nothing)
+    other, both = trial(-1.0, wheels, result=nothing), trial(-0.5, size, wheels, result=nothing)
+    (found,) = competition._causes(best, [base, best, other], base)
+    assert found.probability == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))
+    assert found.instead == str(wheels.state)
+    assert other.beats(best) == pytest.approx(-1.0)  # the same price
+    assert competition._causes(best, [base, best], base)[0].instead == ""  # nothing is off
+    assert competition._causes(best, [best, both], None)[0].instead == ""
+    by_code = {one.code: one.instead for one in competition._causes(both, [base, best, other, both], base)}
+    assert by_code == {"tag-size": str(wheels.state), "odometry-scale": str(size.state)}
+
+
+def ranked(plain: competition.Asked, linear: competition.Asked, *, best: Trial[Any] | None) -> list[list[str]]:
+    """Names of what is asked, turn by turn."""
+    turns = competition._rank(best, cast("Any", None), [], SlamConfig(), (lambda *_: plain, lambda *_: linear))
+    return [[one.code for _, one, _ in turn] for turn in turns]
+
+
+def test_the_cause_that_leads_is_solved_for_before_what_shows_without_a_solution() -> None:
+    best, shows = trial(0.0), suspect("tag-size", "all")
+    lens, mount = suspect("distortion", "camera"), suspect("mount", "x")
+    plain, far = [(math.inf, shows, 0.1)], FAR * lens.sigma
+    linear = [(100.0, lens, 0.2), (24.0, mount, 0.1)]
+    assert ranked(plain, linear, best=best) == [["distortion"], ["tag-size"], ["distortion", "mount"]]
+    assert ranked([], linear, best=best)[0] == ["distortion"]
+    first = [[], ["tag-size"], ["distortion", "mount"]]
+    assert ranked(plain, [(100.0, lens, 0.2), (26.0, mount, 0.1)], best=best) == first  # which may win
+    assert ranked(plain, [(100.0, lens, far), (24.0, mount, 0.1)], best=best) == first  # no linear test reaches it
+    assert ranked(plain, [(20.0, lens, 0.2)], best=best)[0] == []  # what gains less than is asked may win, too
+    assert ranked(plain, [], best=best) == [[], ["tag-size"], []]
+    # the state that shows is the better one
+    assert ranked([(math.inf, lens, -0.1)], linear, best=best) == [[], ["distortion"], ["distortion", "mount"]]
+    # what is discrete, or far off, is in no linear test; nor is anything without a solution
+    as_before = [["tag-size"], ["distortion", "mount"]]
+    assert ranked([(math.inf, shows, far)], linear, best=best) == as_before
+    assert ranked([(math.inf, suspect("tag-size", "all", sigma=math.nan), 0.0)], linear, best=best) == as_before
+    assert ranked(plain, linear, best=None) == as_before

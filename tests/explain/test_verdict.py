@@ -12,7 +12,7 @@ import pytest
 
 from evermap import run_slam
 from evermap.explain.symptoms import Signs, measure_signs
-from evermap.explain.verdict import LIMITS, Limit, judge_signs
+from evermap.explain.verdict import LIMITS, SURE, Limit, judge_signs
 from evermap.types import (
     AssociationEvidence,
     Cause,
@@ -56,15 +56,28 @@ def test_a_cause_is_told_with_its_remedy_where_it_is_sure() -> None:
     assert (found.kind, found.message) == (
         VerdictKind.SENSOR_SUSPECT, "tags are 10 % larger (try: tag_size_m = 0.176)"
     )  # fmt: skip
-    assert judge_signs(GOOD, causes=[replace(size, probability=0.5)]).kind is VerdictKind.SOUND
     of_map = replace(size, code="map-scale", subject="map")
     assert judge_signs(GOOD, causes=[of_map]).kind is VerdictKind.MAP_OUTDATED
+
+
+def test_a_cause_that_another_may_hold_instead_of_is_weak_and_names_both() -> None:
+    size = Cause("tag-size", "all tags", "tags are 10 % larger", probability=0.7, instead="the wheels are smaller")
+    found = judge_signs(GOOD, causes=[size])
+    assert found.kind is VerdictKind.WEAK
+    assert "tags are 10 % larger (70%), or the wheels are smaller" in found.message
+    assert "(70%), or nothing is off" in judge_signs(GOOD, causes=[replace(size, instead="")]).message
+    other = replace(size, subject="1", probability=0.99)
+    assert judge_signs(GOOD, causes=[other, size]).kind is VerdictKind.SENSOR_SUSPECT
+    assert judge_signs(replace(GOOD, nis=20.0), causes=[size]).kind is VerdictKind.LOST
+    assert judge_signs(replace(GOOD, common=9, moved=0.9), causes=[size]).kind is VerdictKind.MAP_OUTDATED
+    assert judge_signs(GOOD, causes=[replace(size, probability=SURE)]).kind is VerdictKind.SENSOR_SUSPECT
 
 
 def test_a_delay_that_the_estimator_put_right_is_no_suspicion() -> None:
     late = Cause("clock", "front", "stamps of front are 0.12 s late", 0.12, 0.002, 0.99, "stamp_s - 0.12")
     found = judge_signs(GOOD, causes=[late])
     assert (found.kind, found.causes) == (VerdictKind.SOUND, (late,))
+    assert judge_signs(GOOD, causes=[replace(late, probability=0.7)]).kind is VerdictKind.SOUND
     assert judge_signs(GOOD, causes=[replace(late, nats=40.0)]).kind is VerdictKind.SENSOR_SUSPECT
 
 

@@ -220,6 +220,30 @@ def test_anchoring_recovers_what_alignment_takes_from_nees():
     assert np.mean(aligned) < 1.6
 
 
+@pytest.mark.parametrize("gauge", [0, 3])
+def test_errors_are_anchored_at_the_pose_that_holds_the_frame(gauge):
+    """Poses by the odometry alone may come before the first one that saw anything."""
+    truth = figure_eight(STAMPS)
+    estimate = truth + [0.1, 0.0, 0.0]
+    estimate[gauge] = truth[gauge]
+    covariance = np.tile(0.1**2 * np.eye(3), (len(STAMPS), 1, 1))
+    covariance[gauge] = 1e-8 * np.eye(3)
+    found = evaluate_trajectory(
+        type(trajectory(STAMPS, truth))(STAMPS, estimate, covariance), trajectory(STAMPS, truth), rate_hz=100.0
+    )
+    np.testing.assert_allclose(found.pose_truth_anchor, np.zeros(3), atol=1e-12)
+    assert found.anchored_nees[gauge] == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(np.delete(found.anchored_nees, gauge), 1.0)
+
+
+def test_no_error_is_anchored_where_nothing_is_scored_near_the_pose_that_holds_the_frame():
+    truth, late = figure_eight(STAMPS), np.arange(len(STAMPS)) > len(STAMPS) // 4
+    covariance = np.tile(0.1**2 * np.eye(3), (len(STAMPS), 1, 1))
+    covariance[0] = 0.0
+    estimate = type(trajectory(STAMPS, truth))(STAMPS, truth, covariance)
+    assert evaluate_trajectory(estimate, trajectory(STAMPS[late], truth[late])).anchored_nees is None
+
+
 def test_drift_equals_evo_relative_error():
     rng = np.random.default_rng(6)
     stamps = np.arange(400.0)

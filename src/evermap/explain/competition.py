@@ -95,8 +95,9 @@ FEWEST_CHANGED, CHANGED = 3, 0.2
 """Landmarks, and share of those in common with a map, that changed from which the map itself is in doubt."""
 AXES_OF_TAGS = frozenset({"map-axes", "corner-order"})
 """Causes of a map by which only the orientations of its tags are others: its shape says which may be."""
-LEAST_LATE_S = 0.02
-"""Delay of the sensor's stamps from which poses are put where the robot was when detections were taken."""
+LEAST_LATE_S, LONGEST_LEAD_S = 0.02, 1.0
+"""Delay of the sensor's stamps from which poses are put where the robot was when detections were taken; and by how much
+commands are stamped before the robot follows them, at most."""
 CLOCK = "clock"
 """Cause of stamps that are late."""
 CHANGES, INNOVATIONS = "changes", "innovations"
@@ -323,12 +324,16 @@ def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
     """Return by how much stamps of the sensor are late, where measured motions in the plane seem early.
 
     Nothing stamps a motion before it was, so what is late are the detections: at their stamps the robot is not where
-    it was when they were taken. In space delays are those of the sensors.
+    it was when they were taken. Commands are stamped before, but no robot follows them so late as `LONGEST_LEAD_S`. In
+    space delays are those of the sensors.
     """
-    if is_in_space(inputs.recording) or not inputs.recording.odometry.is_measured:
+    if is_in_space(inputs.recording):
         return None
-    delay = find_odometry_delay(result)
-    if delay is None or not (delay.p_needed > SURE and -delay.value > max(LEAST_LATE_S, SURELY * delay.sigma)):
+    delay, least_s = (
+        find_odometry_delay(result),
+        LEAST_LATE_S if inputs.recording.odometry.is_measured else LONGEST_LEAD_S,
+    )
+    if delay is None or not (delay.p_needed > SURE and -delay.value > max(least_s, SURELY * delay.sigma)):
         return None
     suspect = next(one for one in list_suspects(inputs, calibrations=True) if one.code == CLOCK)
     return Taken(suspect, -delay.value, delay.sigma**-2)
@@ -477,8 +482,8 @@ def _next_cause(
     def ahead(trial: Trial[VisitT]) -> float:
         return trial.evidence if best is None else trial.beats(best)
 
-    for screen in screens:
-        asked = _diverse(screen(best, inputs, suspects, config), rules.most_tried, tried)
+    for ranked in _rank(best, inputs, suspects, config, screens):
+        asked = _diverse(ranked, rules.most_tried, tried)
         made = (_solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
         trials = sorted((trial for trial in made if trial is not None), key=ahead, reverse=True)
         for row, trial in enumerate(trials[:REFINED]):
@@ -493,6 +498,48 @@ def _next_cause(
         if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
             return winner
     return winner
+
+
+def _rank(
+    best: Trial[VisitT] | None,
+    inputs: Inputs,
+    suspects: list[Suspect],
+    config: SlamConfig,
+    screens: Sequence[Callable[..., Asked]],
+) -> Iterable[Asked]:
+    """Yield causes to solve for in turns, as each of the `screens` lets them through, the first what shows without a
+    solution, and before that the one that leads; there is no need for the next turn where one explains all.
+    """
+    shown, *others = (partial(screen, best, inputs, suspects, config) for screen in screens)
+    plain = shown()
+    if best is None or not others or not all(_is_near(one, state) for _, one, state in plain):
+        yield plain
+        for screen in others:
+            yield screen()
+        return
+    linear = others[0]()
+    yield _find_leader(plain, linear, config.explain.lead_nats)
+    yield plain
+    yield linear
+
+
+def _find_leader(shown: Asked, found: Asked, least: float) -> Asked:
+    """Return the cause by whose linear gain no other can win, if there is one and the linear test reaches it.
+
+    Args:
+        shown: causes that show without a solution, none of which are discrete: of these the state that shows is tried.
+        found: causes by their linear gain, the largest first.
+        least: gain from which a cause is among them [nats].
+    """
+    known = {(one.code, one.subject) for _, one, _ in shown}
+    first = [(gain, one, state) for gain, one, state in found[:1] if (one.code, one.subject) not in known]
+    others = max([least, *(gain for gain, _, _ in found[1:])])
+    return [(gain, one, state) for gain, one, state in first if gain > LINEAR * others and _is_near(one, state)]
+
+
+def _is_near(suspect: Suspect, state: float) -> bool:
+    """Return whether a state is within what is tried of a cause at once; False of discrete ones, which have none."""
+    return abs(state) < FAR * suspect.sigma
 
 
 def _is_metre_known(inputs: Inputs) -> bool:
@@ -982,6 +1029,11 @@ def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     return state, sigma
 
 
+def _say(trial: Trial[VisitT]) -> str:
+    """Return the causes of a trial in words."""
+    return "; ".join(one.suspect.say(_with_own_state(one, trial.solution.result)[0]) for one in trial.taken)
+
+
 def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[VisitT] | None) -> tuple[Cause, ...]:
     """Return the causes of the best trial, with their probabilities among all that was weighed."""
     if not best.taken:
@@ -993,7 +1045,8 @@ def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[Visit
     gained = math.nan if base is None else best.beats(base)
     for one in best.taken:
         name = one.suspect.code, one.suspect.subject
-        holds = [any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed]
+        holds = np.array([any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed])
+        other = None if holds.all() else weighed[int(np.argmax(np.where(holds, -math.inf, relative)))]
         suspect = one.suspect
         state, sigma = _with_own_state(one, best.solution.result)
         value = suspect.shown(state) if suspect.is_continuous else math.nan
@@ -1001,7 +1054,7 @@ def _causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[Visit
         found.append(
             Cause(
                 suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
-                float(share[np.array(holds)].sum()), suspect.fix(state), gained,
+                float(share[holds].sum()), suspect.fix(state), gained, "" if other is None else _say(other),
             )
         )  # fmt: skip
     return tuple(sorted(found, key=lambda cause: -cause.probability))

@@ -302,9 +302,12 @@ def _decide(
         return OUTDATED, f"not localised in the map: {set_aside}"
     if signs.in_map is False:
         return OUTDATED, "what was seen lies nowhere on the map: it is of another site, frame or scale, or mirrored"
-    for kind in (OUTDATED, WEAK):
-        if some := [limit for limit in beyond if limit.kind is kind]:
-            return kind, _reasons(some, alarming)
+    if some := [limit for limit in beyond if limit.kind is OUTDATED]:
+        return OUTDATED, _reasons(some, alarming)
+    if doubtful := [cause for cause in causes if cause.probability < SURE and not _is_put_right(cause)]:
+        return WEAK, _doubt_text(doubtful[0])
+    if some := [limit for limit in beyond if limit.kind is WEAK]:
+        return WEAK, _reasons(some, alarming)
     return VerdictKind.SOUND, "readings, odometry and solution agree"
 
 
@@ -319,6 +322,13 @@ def _is_of_map(cause: Cause) -> bool:
 
 def _cause_text(cause: Cause) -> str:
     return f"{cause.message} (try: {cause.fix})" if cause.fix else cause.message
+
+
+def _doubt_text(cause: Cause) -> str:
+    """Return a cause that was taken, though another explanation may hold as well, and what would decide."""
+    other = cause.instead or "nothing is off"
+    text = f"of two explanations nothing says which holds: {cause.message} ({cause.probability:.0%}), or {other}"
+    return f"{text} (try: a map with surveyed positions, or what is known of either, in sensor.toml)"
 
 
 def _reasons(limits: Sequence[Limit], alarming: dict[str, Symptom]) -> str:

@@ -21,7 +21,7 @@ from evermap.show import ShownTable
 from evermap.types import BoolArray, FloatArray, IntArray, Trajectory, rows_of
 
 ANCHOR_SLACK_S = 1.0
-"""Errors can be anchored at the first pose if the truth begins within this of it."""
+"""Errors can be anchored at the pose that holds the frame if the truth has one within this of it."""
 DRIFT_DISTANCE_M = 10.0
 SAME_S = 1e-3
 """Stamps of the truth and of the estimate that are this close are one."""
@@ -119,7 +119,8 @@ class PoseErrors(ShownTable):
     **Alignment and NEES.** `nees` uses the aligned errors. Alignment removes the degrees of freedom of the frame, while
     the covariances of a map made from an unknown start are those relative to its first pose and grow with the distance
     from it; aligned NEES is therefore too small on average (looks cautious), and only values above the band say
-    anything. `anchored_nees` instead fixes the frame at the first scored pose, the gauge in which the covariances hold:
+    anything. `anchored_nees` instead fixes the frame at the scored pose that is known best, the gauge in which the
+    covariances hold (the first one that saw anything, with poses by the odometry before it, perhaps):
     its expectation is 2, in space 3, but it inherits the truth's own heading error at that one stamp times the
     distance, and its values are one draw rather than many, so its mean scatters widely. Without alignment (map frame
     given) `nees` has expectation 2, in space 3, and `anchored_nees` is None.
@@ -135,7 +136,7 @@ class PoseErrors(ShownTable):
         alignment: how it was found, see `align_poses`, or 'none'.
         nees, anchored_nees: (K,) of the position (2 or 3 degrees of freedom), nan where the pose is exact.
         whole_nees: (K,) of position and orientation together (3 or 6 degrees of freedom), aligned as `nees`.
-        pose_truth_anchor: (3,) or (7,) the alignment that makes the first pose exact, None without one.
+        pose_truth_anchor: (3,) or (7,) the alignment that makes the pose exact that holds the frame, None without one.
         drift_m_per_m: median translation error over 10 m travelled, divided by 10 m; None on shorter runs.
         skipped: stamps left out because the estimate has no pose near them.
     """
@@ -252,9 +253,9 @@ def evaluate_trajectory(
     size = group.point_dim
     pose_truth_estimate, how = align_poses(raw, reference) if align else (group.identity(), "none")
     aligned = group.compose(pose_truth_estimate, raw)
-    anchor = None
-    if align and estimate.frame == "first_pose" and stamps[0] - estimate.stamp_s[0] <= ANCHOR_SLACK_S:
-        anchor = group.compose(reference[0], group.inverse(raw[0]))
+    anchor, (first, held) = None, (_surest(each, size) for each in (covariance, estimate.covariance))
+    if align and estimate.frame == "first_pose" and abs(stamps[first] - estimate.stamp_s[held]) <= ANCHOR_SLACK_S:
+        anchor = group.compose(reference[first], group.inverse(raw[first]))
     wrong = group.local(aligned, reference)
     heading = se2.wrap(aligned[:, 2] - reference[:, 2]) if group is PLANE else np.full(len(rows), np.nan)
     return PoseErrors(
@@ -274,6 +275,11 @@ def evaluate_trajectory(
         drift_m_per_m=drift_per_metre(aligned, reference),
         skipped=skipped,
     )
+
+
+def _surest(covariance: FloatArray, size: int) -> int:
+    """Return the row of the pose whose position is known best: that which holds the frame is known exactly."""
+    return int(np.argmin(np.trace(covariance[:, :size, :size], axis1=1, axis2=2)))
 
 
 def _rows_to_score(

@@ -14,6 +14,9 @@ from evermap.slam.space.drift import drift_of
 from evermap.slam.space.estimate import first_places
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.types import SpatialRecording, rows_of
+from evermap_studies.causes.catalogue import catalogue
+from evermap_studies.causes.drives import as_recording
+from evermap_studies.causes.judge import make_case
 
 from .rooms import Room
 
@@ -65,6 +68,33 @@ def test_errors_that_last_are_found_and_do_not_pull_a_good_odometry_away(seed: i
     assert found.translation is not None
     assert found.translation < 0.006
     assert improvement(recording) < 1.1
+
+
+def test_an_odometry_whose_drift_does_not_show_is_not_held_for_exact() -> None:
+    """At two frames a second hardly a tag is seen often enough: the drift that shows is the least there is."""
+    world = next(one for one in catalogue() if one.name == "poses in a map: nothing wrong")
+    given = make_case(replace(world, make=replace(world.make, frame_hz=2.0)), 1).given
+    recording = as_recording(given)
+    assert isinstance(recording, SpatialRecording)
+    intake = prepare_space(recording, Config().slam.space)
+    found = drift_of(intake.problem, intake.driven_pose)
+    assert found.translation == Config().slam.space.steady_m
+    assert (found.share == 1.0).all()
+    result = run_slam(recording, prior_map=given.places)
+    compared = compare_with_truth(recording, result, rate_hz=10.0)
+    assert compared.poses is not None
+    assert compared.dead_reckoning is not None
+    assert compared.poses.rmse_m < 0.2 * compared.dead_reckoning.rmse_m  # .47 of it where it is held for exact
+    assert np.median(compared.poses.nees) < 2.0 * compared.poses.dof
+
+
+def test_an_odometry_that_is_exact_but_for_what_is_seen_stays_so() -> None:
+    """Among the same few sightings: what is the more probable of the two."""
+    recording = Room.of(0).walk(0, drift=0.0005, n_frames=160)
+    intake = prepare_space(recording, Config().slam.space)
+    assert drift_of(intake.problem, intake.driven_pose).translation == Config().slam.space.steady_m
+    levels = {one.name: one.value for one in run_slam(recording).parameters}
+    assert levels["sigma_odometry_m"] < 0.001
 
 
 def test_a_lone_detection_is_no_newer_than_the_time_that_errors_last() -> None:

@@ -325,6 +325,36 @@ def test_directions_shrink_no_world(drift):
     assert np.ptp(at, axis=0)[:2].sum() == pytest.approx(np.ptp(true, axis=0)[:2].sum(), rel=0.1)
 
 
+def test_directions_know_no_better_metre_than_the_odometry():
+    """Of rounds by an odometer that is 1 % off: without ranges or a map it is the only one that knows a metre."""
+    world = tagged_corridor(0, n_frames=200)
+    recording = as_directions(world, 0)
+    driven = recording.odometry
+    recording = replace(recording, odometry=replace(driven, pose_world_robot=se3.scaled(driven.pose_world_robot, 0.99)))
+    exact, usual = (run_slam(recording, Config(slam={"space": {"scale_sigma": sigma}})) for sigma in (0.0, 0.01))
+    np.testing.assert_array_equal(usual.landmarks.position_m, exact.landmarks.position_m)
+    at = usual.landmarks.position_m
+    more = usual.landmarks.covariance_m2 - exact.landmarks.covariance_m2
+    np.testing.assert_allclose(more, 0.01**2 * at[:, :, None] * at[:, None, :], atol=1e-12)
+    far = usual.trajectory.pose_world_robot[-1, :3]
+    told = [np.trace(result.trajectory.covariance[-1, :3, :3]) for result in (usual, exact)]
+    assert told[0] - told[1] == pytest.approx(0.01**2 * far @ far, rel=1e-6)
+    in_map = [
+        run_slam(recording, Config(slam={"space": {"scale_sigma": sigma}}), prior_map=world.tags.as_prior(0.01))
+        for sigma in (0.0, 0.01)
+    ]
+    np.testing.assert_array_equal(*(one.landmarks.covariance_m2 for one in in_map))
+    stated = replace(recording, sensors=tuple(replace(one, sigma_odometer_scale=0.0) for one in recording.sensors))
+    knows = run_slam(stated, Config(slam={"space": {"scale_sigma": 0.01}}))
+    np.testing.assert_array_equal(knows.landmarks.covariance_m2, exact.landmarks.covariance_m2)
+    seen = recording.detections
+    one_range = seen.covariance_sensor_m2.copy()
+    one_range[0] = 0.01**2 * np.eye(3)
+    near = replace(recording, detections=replace(seen, covariance_sensor_m2=one_range))
+    measured = [run_slam(near, Config(slam={"space": {"scale_sigma": sigma}})) for sigma in (0.0, 0.01)]
+    np.testing.assert_array_equal(*(one.landmarks.covariance_m2 for one in measured))
+
+
 def test_directions_without_odometry_are_left_out():
     recording = as_directions(tagged_corridor(0, odometry=False), 0)
     with pytest.raises(DataError, match="seen in 0 frames"):

@@ -303,10 +303,15 @@ def mount_parameters(name: str, value: FloatArray, sigma: FloatArray, prior: Flo
 
 
 def _undivided(told: _Told) -> float:
-    """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is."""
+    """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is, or
+    of directions alone the odometer.
+    """
     problem, before = told.problem, told.intake.problem.scale_sigma
-    share = 0.0 if len(problem.prior.place) or problem.measurements else problem.ranges_share
-    return float(before * np.sqrt(share * (1.0 - share)))
+    if len(problem.prior.place) or problem.measurements:
+        return 0.0
+    if problem.ray.all() and told.recording.sensors[0].sigma_odometer_scale is None:
+        return problem.settings.scale_sigma
+    return float(before * np.sqrt(problem.ranges_share * (1.0 - problem.ranges_share)))
 
 
 def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:

@@ -238,8 +238,9 @@ def _with_drift(
     And the drift where it was used, or what detections are worth (M,) where that is for covariances only.
 
     Pixels err by themselves, detectors of objects by the view. That errors persist follows from the odometry alone,
-    of which a fast turn or a drift of other than usual form may be wrong. So independent errors are asked as well: they
-    hold where they show no correlation beside a drift that landmarks share, or where they are the more probable.
+    of which a fast turn or a drift of other than usual form may be wrong, and few sightings of each landmark show no
+    drift at all. So independent errors beside the drift that the solution finds are asked as well: they hold where they
+    show no correlation beside a drift that landmarks share, or where they are the more probable.
 
     Args:
         problem: the measurements.
@@ -257,16 +258,15 @@ def _with_drift(
     if problem.steady:
         noise = replace(noise, translation=settings.steady_m, rotation=settings.steady_rad)
     elif drift.translation is not None and drift.rotation is not None:
-        if share.min() < 1.0:
-            free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
-            start = first_places(free, driven)
-            alone = converged(free, start, noise)
-            of_metre = in_map or _is_of_one_metre(alone.estimate, driven)
-            if of_metre and _are_independent(alone, drift.translation):
-                return problem, replace(alone.noise, pixel=noise.pixel), None, None
-            lasting, drift = _likeliest_lasting(replace(free, share=share), start, noise, drift)
-            if of_metre and log_marginal_likelihood(alone, noise) > lasting:
-                return problem, replace(alone.noise, pixel=noise.pixel), None, None
+        free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
+        start = first_places(free, driven)
+        alone = converged(free, start, noise)
+        of_metre = in_map or _is_of_one_metre(alone.estimate, driven)
+        if of_metre and _are_independent(alone, drift.translation):
+            return problem, replace(alone.noise, pixel=noise.pixel), None, None
+        lasting, drift = _likeliest_lasting(replace(free, share=share), start, noise, drift)
+        if of_metre and log_marginal_likelihood(alone, noise) > lasting:
+            return problem, replace(alone.noise, pixel=noise.pixel), None, None
         noise = _with_drift_of(noise, drift)
     return replace(problem, share=share), noise, drift, None
 
