@@ -314,22 +314,20 @@ def arrivals(
     cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[2])
     rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
-        expected: dict[float, float] = {}
-        log_missed: dict[float, float] = {}
+        parts = []
         for place in np.flatnonzero(site_of_place == site).tolist():
             mine = looks.rows.hit & (looks.place == place)
             place_m = after.places.position_m[place, :2]
             seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
-            frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye, settings)
-            for stamp in np.unique(stamps):
-                then = stamps == stamp
-                expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
-                missed = float(frames[then] @ np.log1p(-rate[then])) / settings.sticky
-                log_missed[stamp] = log_missed.get(stamp, 0.0) + missed
-        enough = np.array(sorted(stamp for stamp, number in expected.items() if number >= settings.least_expected))
-        if not len(enough):
+            parts.append(_empty_looks(before.views, rays, seen_from, place_m, at_eye, settings))
+        frames, rate, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
+        stamp_s, then = np.unique(stamps, return_inverse=True)
+        expected, log_missed = (np.bincount(then, weight) for weight in (frames * rate, frames * np.log1p(-rate)))
+        looked_then = expected >= settings.least_expected
+        if not looked_then.any():
             continue
-        p_missed = p_hidden + (1.0 - p_hidden) * np.exp([log_missed[stamp] for stamp in enough.tolist()])
+        enough = stamp_s[looked_then]
+        p_missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked_then] / settings.sticky)
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
         p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * p_hidden)
         at = int(np.flatnonzero(p_after >= settings.sure).max(initial=0))
