@@ -25,7 +25,7 @@ from evermap.errors import InputError
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
 from evermap.maps.shelves import Sight
-from evermap.sensing.sightlines import SightLines, Views, pair_rows
+from evermap.sensing.sightlines import Glimpses, SightLines, Views, pair_rows
 from evermap.show import Shown, draw
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, Tabular, Up, landmark_id_of
 
@@ -263,6 +263,7 @@ class LivingMap(Shown):
         lives: how long things of a class stay, stay away, and where they turn up again.
         sightlines: from where each place can be seen.
         views: from where the robot looked, and when.
+        glimpses: where something was detected that is no landmark of the map, and when.
         sight: both of a large map, whose `sightlines` and `views` have no rows; None in a small one.
         class_names: names of the classes.
         landmark_texts: texts that landmarks were called by, for those that have no number (`types.landmark_id_of`).
@@ -287,6 +288,7 @@ class LivingMap(Shown):
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
     views: Views = field(default_factory=Views.empty)
+    glimpses: Glimpses = field(default_factory=Glimpses.empty)
     sight: Sight | None = None
     class_names: tuple[str, ...] = ()
     landmark_texts: tuple[str, ...] = ()

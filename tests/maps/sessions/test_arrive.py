@@ -14,7 +14,7 @@ from evermap.existence.sites import SiteLooks
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, arrivals, came_after
-from evermap.sensing.sightlines import HEADINGS, SightLines, Views, nominal_lines
+from evermap.sensing.sightlines import HEADINGS, Glimpses, SightLines, Views, nominal_lines
 from evermap.survival import Exponential
 from evermap.types import UNKNOWN, FloatArray, Sensor
 
@@ -161,3 +161,25 @@ def test_views_of_other_places_never_make_an_arrival(seed: int) -> None:
 def test_where_nobody_looked_before_nothing_has_appeared() -> None:
     told = come(a_map())
     assert told.p_appeared.tolist() == [0.0]
+
+
+def test_a_session_that_detected_something_at_a_place_did_not_see_it_empty() -> None:
+    """Nor is it known of older looks whether what they missed came before or after that; newer ones count."""
+    other = np.array([0.25, 0.75, EYE[2]])
+    before = replace(a_map(), views=views_from(EYE, 9, 900.0))
+    told = come(before, seen_from_m=EYE[:2])
+    assert told.p_appeared[0] > 0.5
+
+    def glimpsed(at_m: FloatArray, stamp_s: float, living: LivingMap = before) -> Arrivals:
+        glimpses = Glimpses.empty().joined(at_m[None], stamp_s)
+        return come(replace(living, glimpses=glimpses), seen_from_m=EYE[:2])
+
+    for stamp_s in (900.0, 950.0):
+        there = glimpsed(NEW_M + [0.5, -0.7], stamp_s)
+        assert there.looked_s.tolist() == [-np.inf]
+        assert there.p_appeared.tolist() == [0.0]
+    for at_m, stamp_s in ((NEW_M + [0.5, -0.9], 900.0), (NEW_M, 899.0)):  # beside it; before the look
+        np.testing.assert_array_equal(glimpsed(at_m, stamp_s).p_appeared, told.p_appeared)
+    newer = glimpsed(NEW_M, 900.0, replace(before, views=views_from(other, 9, 950.0, before.views)))
+    assert newer.looked_s.tolist() == [950.0]
+    assert 0.0 < newer.p_appeared[0] < 1.0

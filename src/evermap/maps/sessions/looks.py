@@ -30,7 +30,8 @@ from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nomin
 from evermap.sensing.visibility import LooksAt, NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
-USUAL = LooksConfig()
+USUAL, LIVING = LooksConfig(), LivingConfig()
+NOWHERE = np.zeros((0, 2))
 ROUNDS = 5
 """Of expectation and maximisation, at most."""
 FEWEST = 5
@@ -67,11 +68,13 @@ class Watch(NamedTuple):
         stamp_s: (F,) of the looks of a sensor.
         listed: which places it looked at then, whatever is in the way, and which of them it saw.
         eye: (F, 3) pose of the sensor on the floor: x, y, and the heading in which it looks.
+        glimpsed_m: (K, 2) where something was detected that may stand, but became no landmark.
     """
 
     stamp_s: FloatArray
     listed: LooksAt
     eye: FloatArray
+    glimpsed_m: FloatArray = NOWHERE
 
     @classmethod
     def of(cls, sighting: Sighting, position_m: FloatArray, sensor: Sensor, settings: LooksConfig = USUAL) -> Watch:
@@ -119,7 +122,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     """
     from evermap.sensing.kernels import close_to_hits, grouped, within_reach, witnessed
 
-    places, (stamp_s, listed, eye) = living.places, watch
+    places, (stamp_s, listed, eye, _) = living.places, watch
     floor_m = np.ascontiguousarray(places.position_m[:, :2])  # lines of sight are told apart on the floor
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
     # ranges may be in millimetres
@@ -298,11 +301,15 @@ def arrivals(
     until_s: float,
     looks: PlaceLooks,
     sensor: Sensor,
-    settings: LooksConfig = USUAL,
+    config: LivingConfig = LIVING,
 ) -> Arrivals:
     """Return what earlier sessions saw of the places of new sites until now: of the map before, and after the session
     found these.
+
+    A session that detected something at a place which became no landmark did not see it empty; what was there, or came
+    before, is not known.
     """
+    settings, within_m = config.looks, config.boxes.glimpse_m
     new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
     looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
     if not len(before.views) or not len(new):
@@ -314,12 +321,14 @@ def arrivals(
     cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[2])
     rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
-        parts = []
-        for place in np.flatnonzero(site_of_place == site).tolist():
+        parts, places = [], np.flatnonzero(site_of_place == site)
+        places_m = after.places.position_m[places, :2]
+        since_s = max(before.glimpses.last_near(place_m, within_m) for place_m in places_m)
+        views = before.views.after(since_s)
+        for place, place_m in zip(places.tolist(), places_m, strict=True):
             mine = looks.rows.hit & (looks.place == place)
-            place_m = after.places.position_m[place, :2]
             seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
-            parts.append(_empty_looks(before.views, rays, seen_from, place_m, at_eye, settings))
+            parts.append(_empty_looks(views, rays, seen_from, place_m, at_eye, settings))
         frames, rate, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
         stamp_s, then = np.unique(stamps, return_inverse=True)
         expected, log_missed = (np.bincount(then, weight) for weight in (frames * rate, frames * np.log1p(-rate)))
