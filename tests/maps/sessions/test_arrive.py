@@ -76,11 +76,13 @@ def odds_of_a_newcomer(frames: int, rate: float, since_s: float, p_hidden: float
 @pytest.mark.parametrize("frames", [3, 4, 9, 60])
 @pytest.mark.parametrize("past", [False, True])
 def test_the_odds_of_an_arrival_are_those_by_hand(frames: int, past: bool) -> None:
-    """Seen from where the robot looked before, or where it looked past the place at something behind."""
+    """Seen from where the robot looked before, a line that is known to be clear now; or where it looked past the place
+    at something behind, which may not be along the very line.
+    """
     before = replace(a_map(behind_seen=past), views=views_from(EYE, frames, 900.0))
     told = come(before, seen_from_m=None if past else EYE[:2])
     assert told.looked_s.tolist() == [900.0]
-    odds = odds_of_a_newcomer(frames, 0.8, 21_000.0 - 900.0, before.sightlines.p_hidden[2])
+    odds = odds_of_a_newcomer(frames, 0.8, 21_000.0 - 900.0, before.sightlines.p_hidden[2 if past else 0])
     assert told.p_appeared[0] == pytest.approx(odds / (1.0 + odds), rel=1e-6)
 
 
@@ -92,7 +94,7 @@ def test_the_last_session_that_looked_enough_counts() -> None:
     assert come(before, seen_from_m=EYE[:2]).looked_s.tolist() == [900.0]
     again = replace(a_map(), views=views_from(other, 5, 950.0, views_from(EYE, 9, 900.0)))
     assert come(again, seen_from_m=EYE[:2], stamp_s=400_000.0).looked_s.tolist() == [950.0]
-    soon = come(again, seen_from_m=EYE[:2])
+    soon = come(again, seen_from_m=EYE[:2], stamp_s=13_000.0)
     assert soon.p_appeared[0] < 0.9  # then the first look counts, after which it is most probable
     assert soon.looked_s.tolist() == [900.0]
 
@@ -183,3 +185,26 @@ def test_a_session_that_detected_something_at_a_place_did_not_see_it_empty() -> 
     newer = glimpsed(NEW_M, 900.0, replace(before, views=views_from(other, 9, 950.0, before.views)))
     assert newer.looked_s.tolist() == [950.0]
     assert 0.0 < newer.p_appeared[0] < 1.0
+
+
+@pytest.mark.parametrize(("frames", "clear"), [(2, False), (3, True)])
+def test_only_enough_looks_along_a_line_that_is_clear_now_are_as_good_as_it(frames: int, clear: bool) -> None:
+    """Two frames along it expect less than two detections; the others looked past the place from elsewhere."""
+    rate, elsewhere = 0.8, np.array([0.25, 0.75, EYE[2]])
+    before = replace(a_map(), views=views_from(elsewhere, 6, 900.0, views_from(EYE, frames, 900.0)))
+    told = come(before, seen_from_m=np.array([0.25, -0.25]))
+    p_hidden = before.sightlines.p_hidden[0 if clear else 2]
+    odds = odds_of_a_newcomer(frames + 6, rate, 21_000.0 - 900.0, p_hidden)
+    assert told.p_appeared[0] == pytest.approx(odds / (1.0 + odds), rel=1e-6)
+
+
+def test_what_is_hidden_in_all_sessions_is_no_more_than_what_is_hidden_in_the_clearest() -> None:
+    """One session looked past the place only, a later one along the line that is clear now."""
+    elsewhere = np.array([0.25, 0.75, EYE[2]])
+    before = replace(a_map(), views=views_from(EYE, 9, 900.0, views_from(elsewhere, 6, -9_000.0)))
+    told = come(before, seen_from_m=np.array([0.25, -0.25]))
+    since_s, hidden = 21_000.0 - np.array([-9_000.0, 900.0]), before.sightlines.p_hidden[[2, 0]]
+    p_missed = hidden + (1.0 - hidden) * 0.2 ** (np.array([6, 9]) / STICKY)
+    p_after = came_after(np.exp(-since_s / MEAN_S), p_missed, LooksConfig().lasting * hidden[1])
+    assert told.looked_s.tolist() == [900.0]
+    assert told.p_appeared[0] == pytest.approx(p_after[1], rel=1e-6)

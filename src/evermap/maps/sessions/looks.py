@@ -9,7 +9,9 @@ this place, it came after it with odds
     odds(appeared) = (1 - S(t)) / S(t) / P(all looks missed it | it was there)
 
 since the age of what one comes upon is distributed as a stay is, if hazards are constant (which of them is what is not
-known of a class); several sessions are weighed together. Without a look the map grew, and nothing has changed.
+known of a class); several sessions are weighed together. Without a look the map grew, and nothing has changed. A line
+along which it is seen now is clear, and was so then as probably as any clear line is from session to session; one past
+it is near the line to it only.
 """
 
 from __future__ import annotations
@@ -318,7 +320,7 @@ def arrivals(
     cliques, row = clique_rows(after.sites)
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
-    cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[2])
+    cells, (p_hidden, _, p_hidden_unknown) = after.sightlines.cell_m, before.sightlines.p_hidden.tolist()
     rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
         parts, places = [], np.flatnonzero(site_of_place == site)
@@ -329,16 +331,19 @@ def arrivals(
             mine = looks.rows.hit & (looks.place == place)
             seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
             parts.append(_empty_looks(views, rays, seen_from, place_m, at_eye, settings))
-        frames, rate, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
+        frames, rate, stamps, is_clear = (np.concatenate(column) for column in zip(*parts, strict=True))
         stamp_s, then = np.unique(stamps, return_inverse=True)
-        expected, log_missed = (np.bincount(then, weight) for weight in (frames * rate, frames * np.log1p(-rate)))
+        expected, along_clear, log_missed = (
+            np.bincount(then, weight) for weight in (frames * rate, is_clear * frames * rate, frames * np.log1p(-rate))
+        )
         looked_then = expected >= settings.least_expected
         if not looked_then.any():
             continue
         enough = stamp_s[looked_then]
-        p_missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked_then] / settings.sticky)
+        hidden = np.where(along_clear >= settings.least_expected, p_hidden, p_hidden_unknown)[looked_then]
+        p_missed = hidden + (1.0 - hidden) * np.exp(log_missed[looked_then] / settings.sticky)
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
-        p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * p_hidden)
+        p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * hidden.min())
         at = int(np.flatnonzero(p_after >= settings.sure).max(initial=0))
         looked[k], p_appeared[k] = enough[at], p_after[at]
     return Arrivals(new, looked, p_appeared)
@@ -386,12 +391,14 @@ class _Rays:
 
 def _empty_looks(
     views: Views, rays: _Rays, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor, settings: LooksConfig
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Frames of earlier views that would have shown a place, its detection rate in them, and when they were."""
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Frames of earlier views that would have shown a place, its detection rate in them, when they were, and whether
+    the place is seen along their lines now.
+    """
     pose = views.pose
     near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf)
-    near = near <= settings.near_m
-    near |= rays.pass_by(pose[:, :2], place_m, settings)
+    is_clear = near <= settings.near_m
+    near = is_clear | rays.pass_by(pose[:, :2], place_m, settings)
     pose = pose[near]
     half, field = np.pi / HEADINGS, NominalField(sensor, settings)
     rate = np.min(
@@ -400,7 +407,7 @@ def _empty_looks(
         initial=1.0,
     )
     good = field.worth_a_look(rate)
-    return views.frames[near][good], rate[good], views.stamp_s[near][good]
+    return views.frames[near][good], rate[good], views.stamp_s[near][good], is_clear[near][good]
 
 
 def weigh_misses(
