@@ -103,8 +103,14 @@ class SightLines:
     @property
     def p_hidden(self) -> FloatArray:
         """(3,) probability that a place is hidden for a whole session, by the state of the lines to it."""
+        hidden, shown = self.closed
+        return np.asarray(hidden / (hidden + shown))
+
+    @property
+    def closed(self) -> tuple[FloatArray, FloatArray]:
+        """(3,) and (3,) parameters of the beta distribution of the share of places that are hidden, by the same."""
         at_first, worth = np.array(self.rules.p_hidden), self.rules.hidden_looks
-        return np.asarray((at_first * worth + self.hidden) / (worth + self.hidden + self.shown))
+        return at_first * worth + self.hidden, (1.0 - at_first) * worth + self.shown
 
     def after_session(self, hidden: FloatArray, shown: FloatArray) -> SightLines:
         """Return the profile with expected numbers (3,) of cliques that were hidden, or shown, along clear lines."""

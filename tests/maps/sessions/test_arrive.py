@@ -60,7 +60,8 @@ def come(before: LivingMap, *, stamp_s: float = 21_000.0, seen_from_m: FloatArra
     one = np.ones(1, dtype=np.bool_)
     rows = SiteLooks(np.array([stamp_s]), np.array([clique]), np.array([site]), np.zeros(1, np.int64), one)
     sight = np.zeros(len(np.unique(after.sites.clique_id)), dtype=np.int64)
-    looks = PlaceLooks(rows, np.array([row]), cell, nominal_lines(np.ones(1)), one, one, sight, np.zeros(2))
+    lines, share = nominal_lines(np.ones(1)), np.ones(len(sight))
+    looks = PlaceLooks(rows, np.array([row]), cell, lines, one, one, sight, np.zeros(2), share)
     told = arrivals(before, after, after.stamp_s, looks, SENSOR)
     assert told.site.tolist() == [site]
     return told

@@ -34,8 +34,8 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL, LIVING = LooksConfig(), LivingConfig()
 NOWHERE = np.zeros((0, 2))
-ROUNDS = 5
-"""Of expectation and maximisation, at most."""
+LOGITS = np.linspace(-60.0, 20.0, 801)
+"""Log odds of shares of lines that are closed, over which is integrated."""
 FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
 positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
@@ -102,6 +102,7 @@ class PlaceLooks:
             does not take what stands behind a wall for gone.
         sight: (C,) what is known of the lines to each clique, as a row of `SightConfig.p_hidden`.
         unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
+        share: (C,) what each clique counts for how many are hidden: those looked at from one place count as one.
         rate: how often the session detects, over what lines of sight lead to expect.
     """
 
@@ -113,6 +114,7 @@ class PlaceLooks:
     settled: BoolArray
     sight: IntArray
     unwitnessed: FloatArray
+    share: FloatArray
     rate: float = 1.0
 
 
@@ -145,7 +147,8 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     if not config.learn_sight:
         everything = np.ones(len(rows), dtype=np.bool_)
         sight = np.zeros(len(cliques), dtype=np.int64)
-        return PlaceLooks(rows, place, cell, nominal_lines(p_nominal, rules), everything, settled, sight, np.zeros(2))
+        lines = nominal_lines(p_nominal, rules)
+        return PlaceLooks(rows, place, cell, lines, everything, settled, sight, np.zeros(2), np.ones(len(cliques)))
     names = places.site_id, places.landmark_id
     before, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
     rate = _rate(rows, before.p_detect, seen_before & (p_before >= rules.clear), len(living.sites), rules)
@@ -162,7 +165,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
     was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
     unwitnessed = _unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
-    counts, sight, p_hidden = _hidden(
+    counts, sight, p_hidden, share = _hidden(
         living,
         p_start,
         rows,
@@ -173,7 +176,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         settings,
     )
     lines = lines.at(rate, rules.highest_rate)._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
-    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, rate)
+    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, share, rate)
 
 
 def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int, rules: SightConfig) -> float:
@@ -218,14 +221,15 @@ def _hidden(
     unknown: BoolArray,
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
-) -> tuple[BoolArray, IntArray, FloatArray]:
-    """Return looks that count, the (C,) state of the lines to each clique, and its (C,) probability of being hidden.
+) -> tuple[BoolArray, IntArray, FloatArray, FloatArray]:
+    """Return looks that count, the (C,) state of the lines to each clique, its (C,) probability of being hidden, and
+    what (C,) each counts among those that were looked at from the same place.
 
     By masks (N,) of looks along clear lines, of those with a sighting nearby or behind, and of unknown lines.
 
     A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
     closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
-    while they would leave one by one.
+    while they would leave one by one. For the same reason they are one door where it is counted how many are closed.
     """
     cliques, row = clique_rows(living.sites)
     n, least = len(cliques), settings.witnesses
@@ -235,22 +239,26 @@ def _hidden(
     sight = np.select([n_beside >= least, n_unknown >= least], [1, 2], 0).astype(np.int64)
     known = np.bincount(row, p_start, minlength=n) >= 0.5
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
-    p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= least), hits > 0, p_gone)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
-    missed = np.flatnonzero(counts & ~rows.hit)
-    eye, place_m = ends(missed)
-    of_clique = p_hidden[sight] ** _sides(rows.clique[missed], eye - place_m, n, settings)
-    alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
     looks = np.flatnonzero(clear)
     clique, eye = rows.clique[looks], ends(looks)[0]
     total = np.column_stack([np.bincount(clique, eye[:, k], minlength=n) for k in (0, 1)])
-    middle = total / np.maximum(n_clear, 1)[:, None]
-    for one in alone:
-        others = alone[(alone != one) & known[alone]]
-        others = others[np.hypot(*(middle[others] - middle[one]).T) < settings.together_m]
-        together = float(np.prod(p_gone[others]))
-        of_clique[one] /= of_clique[one] + (1.0 - of_clique[one]) * together
-    return counts, sight, of_clique
+    middle = total / np.where(n_clear > 0, n_clear, np.nan)[:, None]  # of none near nothing
+    looked = known & (n_clear >= least)
+    near = np.linalg.norm(middle[:, None] - middle, axis=2) < settings.together_m
+    # with a witness in each line no one door hides several
+    share = np.where(sight == 0, 1.0 / np.maximum((near & looked & (sight == 0)).sum(axis=1), 1), 1.0)
+    alone = (hits == 0) & (sight == 0) & (n_clear > 0)
+    near &= alone[:, None] & alone
+    np.fill_diagonal(near, True)
+    of_clique = _p_hidden(living.sightlines, sight, looked, hits > 0, p_gone, share, near)
+    missed = np.flatnonzero(counts & ~rows.hit)
+    eye, place_m = ends(missed)
+    of_clique = of_clique ** _sides(rows.clique[missed], eye - place_m, n, settings)
+    np.fill_diagonal(near, False)
+    together = np.exp(near @ np.log(p_gone))
+    of_clique = np.where(alone, of_clique / (of_clique + (1.0 - of_clique) * together), of_clique)
+    return counts, sight, of_clique, share
 
 
 def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
@@ -264,16 +272,42 @@ def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) ->
     return np.asarray(np.clip(sides, 1, settings.most_sides))
 
 
-def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
-    """(3,) probability of being hidden, with what this session says: more is missed than should be gone."""
-    p_hidden = lines.p_hidden
-    for _ in range(ROUNDS):
-        missed = looked & ~seen
-        by_sight = p_hidden[sight]
-        share = by_sight * (1.0 - p_gone) / (by_sight * (1.0 - p_gone) + p_gone)
-        hidden, shown = (np.bincount(sight, w, minlength=3) for w in (missed * share, looked & seen))
-        known = np.array([1.0, 1.0, 0.0])  # lines that were unknown are counted where a clique is known to stand
-        p_hidden = lines.after_session(known * hidden, known * shown).p_hidden
+def _p_hidden(
+    lines: SightLines,
+    sight: IntArray,
+    looked: BoolArray,
+    seen: BoolArray,
+    p_gone: FloatArray,
+    share: FloatArray,
+    near: BoolArray,
+) -> FloatArray:
+    """(C,) probability of being hidden, by what earlier sessions say of such lines, and this one by all other cliques.
+
+    Of so many lines a share `q` is closed, beta distributed. One that shows a clique is open, `1 - q`; one along which
+    a clique was missed is closed, or it is gone: `q (1 - p_gone) + p_gone`. What is looked at from one place counts as
+    one. A clique's own miss is the evidence on it, and counts once.
+
+    Args:
+        lines: with what earlier sessions said.
+        sight: (C,) state of the lines to each clique.
+        looked: (C,) cliques that were looked at often enough, and are believed.
+        seen: (C,) those that were detected.
+        p_gone: (C,) probability that they are gone.
+        share: (C,) what each counts.
+        near: (C, C) what is left out for each: itself, and what is missed along with it.
+    """
+    p_hidden = lines.p_hidden[sight]
+    log_q, log_open = -np.logaddexp(0.0, -LOGITS), -np.logaddexp(0.0, LOGITS)
+    q = np.exp(log_q)
+    hidden, shown = lines.closed
+    for kind in (0, 1):  # lines that were unknown are counted where a clique is known to stand
+        mine = sight == kind
+        missed, n_shown = np.flatnonzero(mine & looked & ~seen), share[mine & looked & seen].sum()
+        fit = share[missed, None] * np.log(q * (1.0 - p_gone[missed, None]) + p_gone[missed, None])
+        log_p = hidden[kind] * log_q + (shown[kind] + n_shown) * log_open
+        log_p = log_p + fit.sum(axis=0) - near[np.ix_(mine, missed)] @ fit
+        weight = np.exp(log_p - log_p.max(axis=1, keepdims=True))
+        p_hidden[mine] = (weight @ q) / weight.sum(axis=1)
     return p_hidden
 
 
