@@ -10,7 +10,7 @@ import numpy as np
 from evermap.existence.sites import Evidence
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap, Members, Metres, Places, Sites, Stays
-from evermap.sensing.sightlines import HEADINGS, SightLines, Views
+from evermap.sensing.sightlines import HEADINGS, Glimpses, SightLines, Views
 from evermap.survival import Exponential, GeneralPurpose, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.types import UNKNOWN, ChangeKind, Clock, MapChange
 
@@ -124,6 +124,7 @@ def random_map(
             random.uniform(0, 1, 30) * now_s,
             random.integers(1, 9, 30).astype(np.float64),
         ),
+        glimpses=Glimpses.empty().joined(random.uniform(-20, 20, (7, 2)), now_s),
     )
 
 

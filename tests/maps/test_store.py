@@ -342,7 +342,8 @@ def to_format_1(manifest: dict[str, Any]) -> None:
     columns, values = manifest["columns"], manifest["values"]
     manifest["format"] = 1
     for name in [*columns]:
-        if name.startswith(("sightlines.", "views.", "metres.")) or name in ("sites.p_kept", "stays.p_gone"):
+        newer = name.startswith(("sightlines.", "views.", "glimpses.", "metres."))
+        if newer or name in ("sites.p_kept", "stays.p_gone"):
             del columns[name]
     for name in [*values]:
         if name.startswith(("sightlines.", "views.")) or name in ("log_size_information", "session_start_s"):
@@ -386,6 +387,7 @@ def test_lines_of_sight_and_views_read_back() -> None:
         ("views", {"frames": -3.0}, "a negative count"),
         ("views", {"stamp_s": np.nan}, "'views.stamp_s' is not finite"),
         ("views", {"cell_m": 0.0}, "a cell without size"),
+        ("glimpses", {"stamp_s": np.inf}, "'glimpses.stamp_s' is not finite"),
     ],
 )
 def test_what_format_2_brought_is_checked(part: str, change: dict[str, float], line: str) -> None:

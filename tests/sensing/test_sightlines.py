@@ -15,6 +15,7 @@ from evermap.errors import InputError
 from evermap.geometry import se2
 from evermap.sensing.sightlines import (
     HEADINGS,
+    Glimpses,
     SightLines,
     Views,
     nominal_lines,
@@ -428,3 +429,24 @@ def test_sessions_to_come_are_predicted_better_than_by_the_field_of_view() -> No
         inside = (p >= low) & (p < low + 0.2)
         assert hit[inside].mean() == pytest.approx(p[inside].mean(), abs=0.12)
     assert len(table) < 8000  # of 28,000 looks
+
+
+def test_of_glimpses_in_one_cell_the_newest_is_kept() -> None:
+    table = Glimpses.empty().joined(np.array([[1.1, -0.2], [1.2, -0.3], [4.0, 4.0]]), 10.0)
+    assert len(table) == 2  # the first two are in one cell
+    table = table.joined(np.array([[1.4, -0.1], [1.6, -0.1]]), 20.0).joined(np.zeros((0, 2)), 30.0)
+    np.testing.assert_array_equal(table.position_m, [[1.4, -0.1], [1.6, -0.1], [4.0, 4.0]])
+    np.testing.assert_array_equal(table.stamp_s, [20.0, 20.0, 10.0])
+    assert table.last_near(np.array([3.5, 3.5]), 0.8) == 10.0
+    assert table.last_near(np.array([2.6, 2.0]), 5.0) == 20.0
+    assert table.last_near(np.array([3.5, 3.5]), 0.6) == -np.inf
+    assert Glimpses.empty().last_near(np.zeros(2), 1e9) == -np.inf
+
+
+def test_views_after_an_instant_are_those_of_sessions_that_ended_later() -> None:
+    pose = np.array([[0.1, 0.1, 0.1], [3.0, 0.1, 0.1]])
+    views = Views.empty().seen_from(pose, 10.0).seen_from(pose[:1], 20.0)
+    assert views.after(9.0) is views
+    assert views.after(10.0).stamp_s.tolist() == [20.0]
+    assert views.after(10.0).cell.tolist() == [[0, 0]]
+    assert len(views.after(20.0)) == 0

@@ -26,7 +26,7 @@ from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks,
 from evermap.maps.lives import Lives
 from evermap.maps.names import Renamed, given_names, landmark_with, rename
 from evermap.maps.shelves import Sight
-from evermap.sensing.sightlines import SightLines, Views, pair_rows
+from evermap.sensing.sightlines import Glimpses, SightLines, Views, pair_rows
 from evermap.show import Shown, draw
 from evermap.types import (
     UNKNOWN,
@@ -277,6 +277,7 @@ class LivingMap(Shown):
         lives: how long things of a class stay, stay away, and where they turn up again.
         sightlines: from where each place can be seen.
         views: from where the robot looked, and when.
+        glimpses: where something was detected that is no landmark of the map, and when.
         sight: both of a large map, whose `sightlines` and `views` have no rows; None in a small one.
         class_names: names of the classes.
         landmark_texts: identities of landmarks that are no numbers (`types.landmark_id_of`); `maps.names` says what
@@ -303,6 +304,7 @@ class LivingMap(Shown):
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
     views: Views = field(default_factory=Views.empty)
+    glimpses: Glimpses = field(default_factory=Glimpses.empty)
     sight: Sight | None = None
     class_names: tuple[str, ...] = ()
     landmark_texts: tuple[str, ...] = ()

@@ -6,7 +6,8 @@ seen along it or along its neighbours; then it is clear, with a detection rate o
 blocked. Misses along lines that are not known to be clear say nothing: nobody has looked at that place.
 
 `Views` remember the cells and headings from which the robot looked, and when: where a landmark turns up that the map
-did not know, they say whether its place had been seen empty.
+did not know, they say whether its place had been seen empty. `Glimpses` remember where something was seen that did not
+become a landmark: such a place was not empty.
 """
 
 from __future__ import annotations
@@ -102,8 +103,14 @@ class SightLines:
     @property
     def p_hidden(self) -> FloatArray:
         """(3,) probability that a place is hidden for a whole session, by the state of the lines to it."""
+        hidden, shown = self.closed
+        return np.asarray(hidden / (hidden + shown))
+
+    @property
+    def closed(self) -> tuple[FloatArray, FloatArray]:
+        """(3,) and (3,) parameters of the beta distribution of the share of places that are hidden, by the same."""
         at_first, worth = np.array(self.rules.p_hidden), self.rules.hidden_looks
-        return np.asarray((at_first * worth + self.hidden) / (worth + self.hidden + self.shown))
+        return at_first * worth + self.hidden, (1.0 - at_first) * worth + self.shown
 
     def after_session(self, hidden: FloatArray, shown: FloatArray) -> SightLines:
         """Return the profile with expected numbers (3,) of cliques that were hidden, or shown, along clear lines."""
@@ -294,6 +301,14 @@ class Views:
         """(V, 3) middles of the cells, and of the headings."""
         return np.column_stack([(self.cell + 0.5) * self.cell_m, (self.heading + 0.5) * (2.0 * np.pi / HEADINGS)])
 
+    def after(self, stamp_s: float) -> Views:
+        """Return the views of sessions that ended after `stamp_s`."""
+        newer = self.stamp_s > stamp_s
+        if newer.all():
+            return self
+        columns = self.cell[newer], self.heading[newer], self.stamp_s[newer], self.frames[newer]
+        return Views(*columns, self.cell_m)
+
     def seen_from(self, pose_map_sensor: FloatArray, stamp_s: float, rate: float = 1.0) -> Views:
         """Return the table after a session that ended at `stamp_s`, with sensor poses (F, 3).
 
@@ -307,6 +322,41 @@ class Views:
         every, first = np.unique(both, axis=0, return_index=True)  # the first of equal rows: those of this session
         stamps = np.append(np.full(len(own), stamp_s), self.stamp_s)[first]
         return Views(every[:, :2], every[:, 2], stamps, frames[first], self.cell_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Glimpses:
+    """Where sessions detected something that no landmark has: (K,) rows sorted by cell, one each.
+
+    Attributes:
+        position_m: (K, 2) on the floor.
+        stamp_s: (K,) end of the last session that detected something there.
+    """
+
+    position_m: FloatArray
+    stamp_s: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    @classmethod
+    def empty(cls) -> Glimpses:
+        """Return a table before any."""
+        return cls(np.zeros((0, 2)), np.zeros(0))
+
+    def joined(self, position_m: FloatArray, stamp_s: float, cell_m: float = 0.5) -> Glimpses:
+        """Return the table after a session that ended at `stamp_s` and detected something at positions (N, 2); one row
+        is kept for each cell of the floor.
+        """
+        position = np.concatenate([position_m, self.position_m])
+        cell = np.floor(position / cell_m).astype(np.int64)
+        first = np.unique(cell, axis=0, return_index=True)[1]  # of equal rows, which are those of this session
+        return Glimpses(position[first], np.append(np.full(len(position_m), stamp_s), self.stamp_s)[first])
+
+    def last_near(self, position_m: FloatArray, within_m: float) -> float:
+        """Return the end of the last session that detected something near a position (2,); -inf if none did."""
+        gap = np.linalg.norm(self.position_m - position_m, axis=1)
+        return float(self.stamp_s[gap <= within_m].max(initial=-np.inf))
 
 
 def session_rate(hit: BoolArray, p_detect: FloatArray, weight: FloatArray, rules: SightConfig = USUAL) -> float:

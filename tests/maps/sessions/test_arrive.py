@@ -14,7 +14,7 @@ from evermap.existence.sites import SiteLooks
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, arrivals, came_after
-from evermap.sensing.sightlines import HEADINGS, SightLines, Views, nominal_lines
+from evermap.sensing.sightlines import HEADINGS, Glimpses, SightLines, Views, nominal_lines
 from evermap.survival import Exponential
 from evermap.types import UNKNOWN, FloatArray, Sensor
 
@@ -60,7 +60,8 @@ def come(before: LivingMap, *, stamp_s: float = 21_000.0, seen_from_m: FloatArra
     one = np.ones(1, dtype=np.bool_)
     rows = SiteLooks(np.array([stamp_s]), np.array([clique]), np.array([site]), np.zeros(1, np.int64), one)
     sight = np.zeros(len(np.unique(after.sites.clique_id)), dtype=np.int64)
-    looks = PlaceLooks(rows, np.array([row]), cell, nominal_lines(np.ones(1)), one, one, sight, np.zeros(2))
+    lines, share = nominal_lines(np.ones(1)), np.ones(len(sight))
+    looks = PlaceLooks(rows, np.array([row]), cell, lines, one, one, sight, np.zeros(2), share)
     told = arrivals(before, after, after.stamp_s, looks, SENSOR)
     assert told.site.tolist() == [site]
     return told
@@ -76,11 +77,13 @@ def odds_of_a_newcomer(frames: int, rate: float, since_s: float, p_hidden: float
 @pytest.mark.parametrize("frames", [3, 4, 9, 60])
 @pytest.mark.parametrize("past", [False, True])
 def test_the_odds_of_an_arrival_are_those_by_hand(frames: int, past: bool) -> None:
-    """Seen from where the robot looked before, or where it looked past the place at something behind."""
+    """Seen from where the robot looked before, a line that is known to be clear now; or where it looked past the place
+    at something behind, which may not be along the very line.
+    """
     before = replace(a_map(behind_seen=past), views=views_from(EYE, frames, 900.0))
     told = come(before, seen_from_m=None if past else EYE[:2])
     assert told.looked_s.tolist() == [900.0]
-    odds = odds_of_a_newcomer(frames, 0.8, 21_000.0 - 900.0, before.sightlines.p_hidden[2])
+    odds = odds_of_a_newcomer(frames, 0.8, 21_000.0 - 900.0, before.sightlines.p_hidden[2 if past else 0])
     assert told.p_appeared[0] == pytest.approx(odds / (1.0 + odds), rel=1e-6)
 
 
@@ -92,7 +95,7 @@ def test_the_last_session_that_looked_enough_counts() -> None:
     assert come(before, seen_from_m=EYE[:2]).looked_s.tolist() == [900.0]
     again = replace(a_map(), views=views_from(other, 5, 950.0, views_from(EYE, 9, 900.0)))
     assert come(again, seen_from_m=EYE[:2], stamp_s=400_000.0).looked_s.tolist() == [950.0]
-    soon = come(again, seen_from_m=EYE[:2])
+    soon = come(again, seen_from_m=EYE[:2], stamp_s=13_000.0)
     assert soon.p_appeared[0] < 0.9  # then the first look counts, after which it is most probable
     assert soon.looked_s.tolist() == [900.0]
 
@@ -161,3 +164,48 @@ def test_views_of_other_places_never_make_an_arrival(seed: int) -> None:
 def test_where_nobody_looked_before_nothing_has_appeared() -> None:
     told = come(a_map())
     assert told.p_appeared.tolist() == [0.0]
+
+
+def test_a_session_that_detected_something_at_a_place_did_not_see_it_empty() -> None:
+    """Nor is it known of older looks whether what they missed came before or after that; newer ones count."""
+    other = np.array([0.25, 0.75, EYE[2]])
+    before = replace(a_map(), views=views_from(EYE, 9, 900.0))
+    told = come(before, seen_from_m=EYE[:2])
+    assert told.p_appeared[0] > 0.5
+
+    def glimpsed(at_m: FloatArray, stamp_s: float, living: LivingMap = before) -> Arrivals:
+        glimpses = Glimpses.empty().joined(at_m[None], stamp_s)
+        return come(replace(living, glimpses=glimpses), seen_from_m=EYE[:2])
+
+    for stamp_s in (900.0, 950.0):
+        there = glimpsed(NEW_M + [0.5, -0.7], stamp_s)
+        assert there.looked_s.tolist() == [-np.inf]
+        assert there.p_appeared.tolist() == [0.0]
+    for at_m, stamp_s in ((NEW_M + [0.5, -0.9], 900.0), (NEW_M, 899.0)):  # beside it; before the look
+        np.testing.assert_array_equal(glimpsed(at_m, stamp_s).p_appeared, told.p_appeared)
+    newer = glimpsed(NEW_M, 900.0, replace(before, views=views_from(other, 9, 950.0, before.views)))
+    assert newer.looked_s.tolist() == [950.0]
+    assert 0.0 < newer.p_appeared[0] < 1.0
+
+
+@pytest.mark.parametrize(("frames", "clear"), [(2, False), (3, True)])
+def test_only_enough_looks_along_a_line_that_is_clear_now_are_as_good_as_it(frames: int, clear: bool) -> None:
+    """Two frames along it expect less than two detections; the others looked past the place from elsewhere."""
+    rate, elsewhere = 0.8, np.array([0.25, 0.75, EYE[2]])
+    before = replace(a_map(), views=views_from(elsewhere, 6, 900.0, views_from(EYE, frames, 900.0)))
+    told = come(before, seen_from_m=np.array([0.25, -0.25]))
+    p_hidden = before.sightlines.p_hidden[0 if clear else 2]
+    odds = odds_of_a_newcomer(frames + 6, rate, 21_000.0 - 900.0, p_hidden)
+    assert told.p_appeared[0] == pytest.approx(odds / (1.0 + odds), rel=1e-6)
+
+
+def test_what_is_hidden_in_all_sessions_is_no_more_than_what_is_hidden_in_the_clearest() -> None:
+    """One session looked past the place only, a later one along the line that is clear now."""
+    elsewhere = np.array([0.25, 0.75, EYE[2]])
+    before = replace(a_map(), views=views_from(EYE, 9, 900.0, views_from(elsewhere, 6, -9_000.0)))
+    told = come(before, seen_from_m=np.array([0.25, -0.25]))
+    since_s, hidden = 21_000.0 - np.array([-9_000.0, 900.0]), before.sightlines.p_hidden[[2, 0]]
+    p_missed = hidden + (1.0 - hidden) * 0.2 ** (np.array([6, 9]) / STICKY)
+    p_after = came_after(np.exp(-since_s / MEAN_S), p_missed, LooksConfig().lasting * hidden[1])
+    assert told.looked_s.tolist() == [900.0]
+    assert told.p_appeared[0] == pytest.approx(p_after[1], rel=1e-6)

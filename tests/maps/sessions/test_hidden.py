@@ -92,8 +92,12 @@ def test_a_witness_makes_a_miss_say_more() -> None:
     living = a_map(place_m, clear=(1, 2, 3))
     alone, witnessed = (evidence(living, looks_of(living, seen))[1] for seen in ((3,), (2, 3)))
     assert witnessed < alone - 0.5
-    assert looks_of(living, (2, 3)).sight[0] == 1
     assert looks_of(living, (3,)).sight[0] == 0
+    # the others are of another kind of lines: of its own nothing is known but what it says itself
+    looks = looks_of(living, (2, 3))
+    assert looks.sight.tolist() == [1, 0, 0]
+    np.testing.assert_array_equal(looks.share, 1.0)
+    assert hidden_of(living, looks, 1) == pytest.approx(P_HIDDEN[1], rel=1e-3)
 
 
 def p_hidden_of(living: LivingMap, looks: PlaceLooks) -> FloatArray:
@@ -113,40 +117,112 @@ def test_one_closed_door_over_many_things_is_not_told_as_many_leavings(n: int) -
         assert of_door[0] <= -LEAST_EVIDENCE
     if n >= 3:
         assert min(of_door) > -LEAST_EVIDENCE / 2.0
-    # by hand: they left one by one, or one door hides them, with the share that the session itself says
+    # by hand: they left one by one, or one door hides them; of doors say the prior, and what is seen, by its share
     keys = {int(k) for name in behind for k in looks.rows.key[rows_of_landmark(living, looks, name)]}
     hidden = p_hidden_of(living, looks)[sorted(keys)]
     p_gone = 0.05
-    single = hidden_alone(n, p_gone, seen=1)
+    single = share_closed(shown=1.0 / (n + 1))
     by_hand = single / (single + (1.0 - single) * p_gone ** (n - 1))
-    np.testing.assert_allclose(hidden, by_hand, rtol=1e-6)
+    np.testing.assert_allclose(hidden, by_hand, rtol=1e-4)
 
 
-def hidden_alone(missed: int, p_gone: float, seen: int) -> float:
-    """Probability of a hidden place, by expectation maximisation of counts: Beta mean of prior and session."""
+def share_closed(shown: float, missed: int = 0, p_gone: float = 0.05) -> float:
+    """Mean share of closed lines, by the moments of its beta distribution, after so many shown and missed."""
+    a, b = P_HIDDEN[0] * HIDDEN_LOOKS, (1.0 - P_HIDDEN[0]) * HIDDEN_LOOKS + shown
+    moment = np.cumprod(np.append(1.0, (a + np.arange(missed + 1)) / (a + b + np.arange(missed + 1))))
+    fits = np.ones(1)
+    for _ in range(missed):  # a polynomial in the share
+        fits = np.convolve(fits, [p_gone, 1.0 - p_gone])
+    return float(fits @ moment[1:] / (fits @ moment[:-1]))
 
-    p = P_HIDDEN[0]
-    for _ in range(5):
-        share = p * (1.0 - p_gone) / (p * (1.0 - p_gone) + p_gone)
-        p = (P_HIDDEN[0] * HIDDEN_LOOKS + missed * share) / (HIDDEN_LOOKS + missed * share + seen)
-    return float(p)
+
+ROOMS_M = {name: (6.0, 20.0 * k + 0.25) for k, name in enumerate((1, 2, 3, 4))}
+
+
+def looks_in_rooms(
+    seen: tuple[int, ...], place_m: dict[int, tuple[float, float]] = ROOMS_M
+) -> tuple[LivingMap, PlaceLooks]:
+    """Things in rooms that are looked at one after the other, from inside; some are seen."""
+    living = a_map(place_m, clear=())
+    names = living.places.site_id, living.places.landmark_id
+    eyes = np.array([(0.25, 20.0 * round(y / 20.0) + 0.25) for _, y in place_m.values()])
+    place = np.repeat(living.place_row(np.array([*place_m]), living.site_of()), 20)
+    cell = living.sightlines.cells(np.repeat(eyes, 20, axis=0), living.places.position_m[place])
+    hit = np.arange(len(place)) % 5 > 0
+    lines = living.sightlines.learned(names, place, cell, hit, np.ones(len(place)))
+    living = replace(living, sightlines=lines)
+    n = 12 * len(eyes)
+    frame = np.flatnonzero(np.isin(np.repeat([*place_m], 12), seen))
+    pose = np.column_stack([np.repeat(eyes, 12, axis=0), np.zeros(n)])
+    sighting = Sighting(1000.0 + np.arange(n), pose, frame, place[::20][frame // 12])
+    watch = Watch.of(sighting, living.places.position_m, SENSOR)
+    return living, looked_at(living, living.sites.p_here, watch, LivingConfig())
+
+
+def hidden_of(living: LivingMap, looks: PlaceLooks, landmark: int) -> float:
+    """The probability that one of them is hidden; the same along all lines."""
+    found = p_hidden_of(living, looks)[looks.rows.key[rows_of_landmark(living, looks, landmark)]]
+    np.testing.assert_allclose(found, found[0])
+    return float(found[0])
 
 
 def test_things_in_different_rooms_are_not_behind_one_door() -> None:
-    """Missed from places far from each other: each speaks for itself."""
-    place_m = {1: (6.0, 0.25), 2: (6.0, 20.25), 3: (6.0, 40.25)}
-    living = a_map(place_m, clear=())
-    names = living.places.site_id, living.places.landmark_id
-    eyes = np.array([(0.25, 0.25), (0.25, 20.25), (0.25, 40.25)])
-    place = living.place_row(np.array([1, 2, 3]), living.site_of())
-    cell = living.sightlines.cells(np.repeat(eyes, 20, axis=0), living.places.position_m[np.repeat(place, 20)])
-    hit = np.arange(60) % 5 > 0
-    living = replace(living, sightlines=living.sightlines.learned(names, np.repeat(place, 20), cell, hit, np.ones(60)))
-    none = np.zeros(0, dtype=np.int64)
-    pose = np.column_stack([np.repeat(eyes, 12, axis=0), np.zeros(36)])
-    sighting = Sighting(1000.0 + np.arange(36), pose, none, none)
-    looks = looked_at(living, living.sites.p_here, Watch.of(sighting, living.places.position_m, SENSOR), LivingConfig())
-    np.testing.assert_allclose(p_hidden_of(living, looks), hidden_alone(3, 0.05, seen=0), rtol=1e-6)
+    """Missed from places far from each other: each speaks for itself, and for how many doors are shut."""
+    living, looks = looks_in_rooms(())
+    for landmark in ROOMS_M:
+        assert hidden_of(living, looks, landmark) == pytest.approx(share_closed(0.0, 3), rel=1e-4)
+
+
+@pytest.mark.parametrize("missed", [(1,), (1, 3), (2, 3, 4)])
+def test_how_many_doors_are_shut_is_what_the_others_say(missed: tuple[int, ...]) -> None:
+    """A miss is evidence on what is missed, with the probability of a shut door by all others: it counts once."""
+    living, looks = looks_in_rooms(tuple(name for name in ROOMS_M if name not in missed))
+    np.testing.assert_array_equal(looks.share, 1.0)
+    for landmark in missed:
+        by_hand = share_closed(4.0 - len(missed), len(missed) - 1)
+        assert hidden_of(living, looks, landmark) == pytest.approx(by_hand, rel=1e-4)
+
+
+def test_what_has_a_witness_is_hidden_by_itself() -> None:
+    """No door hides several things if something else is seen beside each; what has none is of another kind."""
+    place_m = {1: (6.0, 0.25), 2: (6.0, 0.9), 3: (6.0, -4.0), 4: (6.0, -4.6), 5: (6.0, 5.0), 6: (8.0, -9.0)}
+    living = a_map(place_m, clear=(*place_m,))
+    looks = looks_of(living, (2, 3, 4, 5))
+    assert looks.sight.tolist() == [1, 0, 1, 1, 0, 0]
+    np.testing.assert_allclose(looks.share, [1.0, 1.0 / 3.0, 1.0, 1.0, 1.0 / 3.0, 1.0 / 3.0])
+    by_hand = P_HIDDEN[1] * HIDDEN_LOOKS / (HIDDEN_LOOKS + 2.0)
+    assert hidden_of(living, looks, 1) == pytest.approx(by_hand, rel=1e-3)
+    assert hidden_of(living, looks, 6) == pytest.approx(share_closed(2.0 / 3.0), rel=1e-4)
+
+
+def test_a_glance_says_nothing_of_how_many_doors_are_shut() -> None:
+    """Of what is looked at in fewer frames than a witness takes."""
+    place_m = {1: (8.0, 3.0), 2: (6.0, -5.0)}
+    living = a_map(place_m, clear=(1, 2))
+    for frames, shown in ((2, 0.0), (3, 0.5)):
+        assert hidden_of(living, looks_of(living, (2,), frames), 1) == pytest.approx(share_closed(shown), rel=1e-4)
+
+
+def test_what_one_door_hides_says_elsewhere_what_one_thing_says() -> None:
+    """Two things that are missed in one room are one shut door for what is missed in another."""
+    living, looks = looks_in_rooms((2, 3), {**ROOMS_M, 5: (6.0, 62.25)})
+    np.testing.assert_allclose(looks.share, [1.0, 1.0, 1.0, 0.5, 0.5])
+    assert hidden_of(living, looks, 1) == pytest.approx(share_closed(2.0, 1), rel=1e-4)
+    # both are behind it, or gone
+    single = share_closed(2.0, 1)
+    for landmark in (4, 5):
+        assert hidden_of(living, looks, landmark) == pytest.approx(single / (single + (1.0 - single) * 0.05), rel=1e-4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_what_is_shown_from_one_place_counts_as_one(n: int) -> None:
+    """One open door shows many things; they say of others what one of them says."""
+    shown = {20 + k: (5.0 + k, -7.0 + 2.2 * k) for k in range(n)}
+    living = a_map({1: (8.0, 3.0), **shown}, clear=(1, *shown))
+    looks = looks_of(living, seen=(*shown,))
+    assert looks.sight.tolist() == [0] * (n + 1)
+    np.testing.assert_allclose(looks.share, 1.0 / (n + 1))
+    assert hidden_of(living, looks, 1) == pytest.approx(share_closed(n / (n + 1)), rel=1e-4)
 
 
 def test_what_is_believed_gone_is_no_witness_of_a_door() -> None:
@@ -155,6 +231,11 @@ def test_what_is_believed_gone_is_no_witness_of_a_door() -> None:
     living = a_map(behind, clear=(*behind,))
     p_here = np.where(living.sites.clique_id == living.members.clique_id[0], 0.95, 0.02)
     away = replace(living, sites=replace(living.sites, p_here=p_here))
+    looks = looks_of(away, ())
+    assert looks.share[0] == 1.0
+    single, p_gone = share_closed(0.0), 0.98
+    by_hand = single / (single + (1.0 - single) * p_gone**3)
+    assert hidden_of(away, looks, 10) == pytest.approx(by_hand, rel=1e-4)
     assert evidence(away, looks_of(away, ()))[10] <= -1.0
     assert evidence(living, looks_of(living, ()))[10] > -1.0
 

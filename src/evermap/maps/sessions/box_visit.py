@@ -198,7 +198,22 @@ class BoxVisit(SpatialVisit):
         if len(self.tied_m):
             away = np.linalg.norm(watch.eye[:, None, :2] - self.tied_m, axis=2).min(axis=1)
             shown &= hit | (away <= settings.tied_m)[listed.pose]
-        return watch._replace(listed=listed._replace(hit=hit).rows(shown))
+        glimpsed_m = self._unassigned(rows, at[:, :2], settings)
+        return watch._replace(listed=listed._replace(hit=hit).rows(shown), glimpsed_m=glimpsed_m)
+
+    def _unassigned(self, rows: IntArray, at_m: FloatArray, settings: BoxesConfig) -> FloatArray:
+        """Of boxes, rows (N,) at (N, 2), the positions (K, 2) of those that may stand, but are of no landmark of the
+        map, and of none that was seen to leave: where there are several; one alone may be a wrong box.
+        """
+        taken, of_place = self.taken, self.kept.copy()
+        of_place[self.boxes.place[np.isfinite(self.boxes.until_s)]] = True
+        assigned = taken.used[self.intake.used][of_place[self.intake.problem.place]]
+        moves = boxes_of(taken.recording)[taken.stays.p_static < 0.5]
+        at_m = at_m[~np.isin(rows, assigned) & ~np.isin(rows, moves)]
+        if not len(at_m):
+            return at_m
+        count = cKDTree(at_m).query_ball_point(at_m, settings.glimpse_m, return_length=True)
+        return np.asarray(at_m[count >= settings.fewest_glimpses])
 
     def _detected(self) -> tuple[IntArray, FloatArray]:
         """Rows (N,) of boxes in frames that have a pose, and (N, 3) where they are."""

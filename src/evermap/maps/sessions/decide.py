@@ -51,7 +51,7 @@ def decided(
     told, hidden, shown = _told(before, entered), session.hidden, session.shown
     for row, clique in enumerate(session.cliques.tolist()):
         if session.missed[row] and not session.was_hit[row]:  # the more probably hidden, the more it stands there
-            hidden[session.sight[row]] += 1.0 - session.p_away[row]
+            hidden[session.sight[row]] += looks.share[row] * (1.0 - session.p_away[row])
         if clique in told:
             session.told_before(row, *told[clique])
         else:
@@ -201,7 +201,7 @@ class _Session:
         share = min(self.p_kept[site] / sites.p_here[site], 1.0)
         self.p_kept[site] = sites.p_here[site]
         same = newest >= 0 and self.entered.stays.site_id[newest] == sites.site_id[site]
-        self.hidden[self.sight[row]] += share * self.p_gone[newest] if same else 0.0
+        self.hidden[self.sight[row]] += self.looks.share[row] * share * self.p_gone[newest] if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             self.last_s[newest], self.gone_s[newest], self.p_gone[newest] = seen_s, np.inf, 0.0
             at = _row(self.before, int(sites.site_id[site]))
@@ -235,8 +235,8 @@ class _Session:
             self.last_s[stay] = max(self.last_s[stay], sites.seen_s[site])
             if self.hits[site]:  # if it was missed before, it was hidden then
                 share = min(self.p_kept[site] / sites.p_here[site], 1.0)
-                self.hidden[self.sight[row]] += share * self.p_gone[stay]
-                self.shown[self.sight[row]] += 1.0
+                self.hidden[self.sight[row]] += self.looks.share[row] * share * self.p_gone[stay]
+                self.shown[self.sight[row]] += self.looks.share[row]
                 self.p_gone[stay] = 0.0
             elif self.missed[row]:
                 self.p_gone[stay] = self.p_away[row]

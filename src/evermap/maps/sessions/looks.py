@@ -9,7 +9,9 @@ this place, it came after it with odds
     odds(appeared) = (1 - S(t)) / S(t) / P(all looks missed it | it was there)
 
 since the age of what one comes upon is distributed as a stay is, if hazards are constant (which of them is what is not
-known of a class); several sessions are weighed together. Without a look the map grew, and nothing has changed.
+known of a class); several sessions are weighed together. Without a look the map grew, and nothing has changed. A line
+along which it is seen now is clear, and was so then as probably as any clear line is from session to session; one past
+it is near the line to it only.
 """
 
 from __future__ import annotations
@@ -30,9 +32,10 @@ from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nomin
 from evermap.sensing.visibility import LooksAt, NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
-USUAL = LooksConfig()
-ROUNDS = 5
-"""Of expectation and maximisation, at most."""
+USUAL, LIVING = LooksConfig(), LivingConfig()
+NOWHERE = np.zeros((0, 2))
+LOGITS = np.linspace(-60.0, 20.0, 801)
+"""Log odds of shares of lines that are closed, over which is integrated."""
 FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
 positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
@@ -67,11 +70,13 @@ class Watch(NamedTuple):
         stamp_s: (F,) of the looks of a sensor.
         listed: which places it looked at then, whatever is in the way, and which of them it saw.
         eye: (F, 3) pose of the sensor on the floor: x, y, and the heading in which it looks.
+        glimpsed_m: (K, 2) where something was detected that may stand, but became no landmark.
     """
 
     stamp_s: FloatArray
     listed: LooksAt
     eye: FloatArray
+    glimpsed_m: FloatArray = NOWHERE
 
     @classmethod
     def of(cls, sighting: Sighting, position_m: FloatArray, sensor: Sensor, settings: LooksConfig = USUAL) -> Watch:
@@ -97,6 +102,7 @@ class PlaceLooks:
             does not take what stands behind a wall for gone.
         sight: (C,) what is known of the lines to each clique, as a row of `SightConfig.p_hidden`.
         unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
+        share: (C,) what each clique counts for how many are hidden: those looked at from one place count as one.
         rate: how often the session detects, over what lines of sight lead to expect.
     """
 
@@ -108,6 +114,7 @@ class PlaceLooks:
     settled: BoolArray
     sight: IntArray
     unwitnessed: FloatArray
+    share: FloatArray
     rate: float = 1.0
 
 
@@ -119,7 +126,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     """
     from evermap.sensing.kernels import close_to_hits, grouped, within_reach, witnessed
 
-    places, (stamp_s, listed, eye) = living.places, watch
+    places, (stamp_s, listed, eye, _) = living.places, watch
     floor_m = np.ascontiguousarray(places.position_m[:, :2])  # lines of sight are told apart on the floor
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
     # ranges may be in millimetres
@@ -140,7 +147,8 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     if not config.learn_sight:
         everything = np.ones(len(rows), dtype=np.bool_)
         sight = np.zeros(len(cliques), dtype=np.int64)
-        return PlaceLooks(rows, place, cell, nominal_lines(p_nominal, rules), everything, settled, sight, np.zeros(2))
+        lines = nominal_lines(p_nominal, rules)
+        return PlaceLooks(rows, place, cell, lines, everything, settled, sight, np.zeros(2), np.ones(len(cliques)))
     names = places.site_id, places.landmark_id
     before, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
     rate = _rate(rows, before.p_detect, seen_before & (p_before >= rules.clear), len(living.sites), rules)
@@ -157,7 +165,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
     was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
     unwitnessed = _unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
-    counts, sight, p_hidden = _hidden(
+    counts, sight, p_hidden, share = _hidden(
         living,
         p_start,
         rows,
@@ -168,7 +176,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         settings,
     )
     lines = lines.at(rate, rules.highest_rate)._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
-    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, rate)
+    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, share, rate)
 
 
 def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int, rules: SightConfig) -> float:
@@ -215,14 +223,15 @@ def _hidden(
     unknown: BoolArray,
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
-) -> tuple[BoolArray, IntArray, FloatArray]:
-    """Return looks that count, the (C,) state of the lines to each clique, and its (C,) probability of being hidden.
+) -> tuple[BoolArray, IntArray, FloatArray, FloatArray]:
+    """Return looks that count, the (C,) state of the lines to each clique, its (C,) probability of being hidden, and
+    what (C,) each counts among those that were looked at from the same place.
 
     By masks (N,) of looks along clear lines, of those with a sighting nearby or behind, and of unknown lines.
 
     A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
     closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
-    while they would leave one by one.
+    while they would leave one by one. For the same reason they are one door where it is counted how many are closed.
     """
     cliques, row = clique_rows(living.sites)
     n, least = len(cliques), settings.witnesses
@@ -232,22 +241,26 @@ def _hidden(
     sight = np.select([n_beside >= least, n_unknown >= least], [1, 2], 0).astype(np.int64)
     known = np.bincount(row, p_start, minlength=n) >= 0.5
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
-    p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= least), hits > 0, p_gone)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
-    missed = np.flatnonzero(counts & ~rows.hit)
-    eye, place_m = ends(missed)
-    of_clique = p_hidden[sight] ** _sides(rows.clique[missed], eye - place_m, n, settings)
-    alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
     looks = np.flatnonzero(clear)
     clique, eye = rows.clique[looks], ends(looks)[0]
     total = np.column_stack([np.bincount(clique, eye[:, k], minlength=n) for k in (0, 1)])
-    middle = total / np.maximum(n_clear, 1)[:, None]
-    for one in alone:
-        others = alone[(alone != one) & known[alone]]
-        others = others[np.hypot(*(middle[others] - middle[one]).T) < settings.together_m]
-        together = float(np.prod(p_gone[others]))
-        of_clique[one] /= of_clique[one] + (1.0 - of_clique[one]) * together
-    return counts, sight, of_clique
+    middle = total / np.where(n_clear > 0, n_clear, np.nan)[:, None]  # of none near nothing
+    looked = known & (n_clear >= least)
+    near = np.linalg.norm(middle[:, None] - middle, axis=2) < settings.together_m
+    # with a witness in each line no one door hides several
+    share = np.where(sight == 0, 1.0 / np.maximum((near & looked & (sight == 0)).sum(axis=1), 1), 1.0)
+    alone = (hits == 0) & (sight == 0) & (n_clear > 0)
+    near &= alone[:, None] & alone
+    np.fill_diagonal(near, True)
+    of_clique = _p_hidden(living.sightlines, sight, looked, hits > 0, p_gone, share, near)
+    missed = np.flatnonzero(counts & ~rows.hit)
+    eye, place_m = ends(missed)
+    of_clique = of_clique ** _sides(rows.clique[missed], eye - place_m, n, settings)
+    np.fill_diagonal(near, False)
+    together = np.exp(near @ np.log(p_gone))
+    of_clique = np.where(alone, of_clique / (of_clique + (1.0 - of_clique) * together), of_clique)
+    return counts, sight, of_clique, share
 
 
 def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
@@ -261,16 +274,42 @@ def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) ->
     return np.asarray(np.clip(sides, 1, settings.most_sides))
 
 
-def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
-    """(3,) probability of being hidden, with what this session says: more is missed than should be gone."""
-    p_hidden = lines.p_hidden
-    for _ in range(ROUNDS):
-        missed = looked & ~seen
-        by_sight = p_hidden[sight]
-        share = by_sight * (1.0 - p_gone) / (by_sight * (1.0 - p_gone) + p_gone)
-        hidden, shown = (np.bincount(sight, w, minlength=3) for w in (missed * share, looked & seen))
-        known = np.array([1.0, 1.0, 0.0])  # lines that were unknown are counted where a clique is known to stand
-        p_hidden = lines.after_session(known * hidden, known * shown).p_hidden
+def _p_hidden(
+    lines: SightLines,
+    sight: IntArray,
+    looked: BoolArray,
+    seen: BoolArray,
+    p_gone: FloatArray,
+    share: FloatArray,
+    near: BoolArray,
+) -> FloatArray:
+    """(C,) probability of being hidden, by what earlier sessions say of such lines, and this one by all other cliques.
+
+    Of so many lines a share `q` is closed, beta distributed. One that shows a clique is open, `1 - q`; one along which
+    a clique was missed is closed, or it is gone: `q (1 - p_gone) + p_gone`. What is looked at from one place counts as
+    one. A clique's own miss is the evidence on it, and counts once.
+
+    Args:
+        lines: with what earlier sessions said.
+        sight: (C,) state of the lines to each clique.
+        looked: (C,) cliques that were looked at often enough, and are believed.
+        seen: (C,) those that were detected.
+        p_gone: (C,) probability that they are gone.
+        share: (C,) what each counts.
+        near: (C, C) what is left out for each: itself, and what is missed along with it.
+    """
+    p_hidden = lines.p_hidden[sight]
+    log_q, log_open = -np.logaddexp(0.0, -LOGITS), -np.logaddexp(0.0, LOGITS)
+    q = np.exp(log_q)
+    hidden, shown = lines.closed
+    for kind in (0, 1):  # lines that were unknown are counted where a clique is known to stand
+        mine = sight == kind
+        missed, n_shown = np.flatnonzero(mine & looked & ~seen), share[mine & looked & seen].sum()
+        fit = share[missed, None] * np.log(q * (1.0 - p_gone[missed, None]) + p_gone[missed, None])
+        log_p = hidden[kind] * log_q + (shown[kind] + n_shown) * log_open
+        log_p = log_p + fit.sum(axis=0) - near[np.ix_(mine, missed)] @ fit
+        weight = np.exp(log_p - log_p.max(axis=1, keepdims=True))
+        p_hidden[mine] = (weight @ q) / weight.sum(axis=1)
     return p_hidden
 
 
@@ -300,11 +339,15 @@ def arrivals(
     until_s: float,
     looks: PlaceLooks,
     sensor: Sensor,
-    settings: LooksConfig = USUAL,
+    config: LivingConfig = LIVING,
 ) -> Arrivals:
     """Return what earlier sessions saw of the places of new sites until now: of the map before, and after the session
     found these.
+
+    A session that detected something at a place which became no landmark did not see it empty; what was there, or came
+    before, is not known.
     """
+    settings, within_m = config.looks, config.boxes.glimpse_m
     new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
     looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
     if not len(before.views) or not len(new):
@@ -313,27 +356,30 @@ def arrivals(
     cliques, row = clique_rows(after.sites)
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
-    cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[2])
+    cells, (p_hidden, _, p_hidden_unknown) = after.sightlines.cell_m, before.sightlines.p_hidden.tolist()
     rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
-        expected: dict[float, float] = {}
-        log_missed: dict[float, float] = {}
-        for place in np.flatnonzero(site_of_place == site).tolist():
+        parts, places = [], np.flatnonzero(site_of_place == site)
+        places_m = after.places.position_m[places, :2]
+        since_s = max(before.glimpses.last_near(place_m, within_m) for place_m in places_m)
+        views = before.views.after(since_s)
+        for place, place_m in zip(places.tolist(), places_m, strict=True):
             mine = looks.rows.hit & (looks.place == place)
-            place_m = after.places.position_m[place, :2]
             seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
-            frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye, settings)
-            for stamp in np.unique(stamps):
-                then = stamps == stamp
-                expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
-                missed = float(frames[then] @ np.log1p(-rate[then])) / settings.sticky
-                log_missed[stamp] = log_missed.get(stamp, 0.0) + missed
-        enough = np.array(sorted(stamp for stamp, number in expected.items() if number >= settings.least_expected))
-        if not len(enough):
+            parts.append(_empty_looks(views, rays, seen_from, place_m, at_eye, settings))
+        frames, rate, stamps, is_clear = (np.concatenate(column) for column in zip(*parts, strict=True))
+        stamp_s, then = np.unique(stamps, return_inverse=True)
+        expected, along_clear, log_missed = (
+            np.bincount(then, weight) for weight in (frames * rate, is_clear * frames * rate, frames * np.log1p(-rate))
+        )
+        looked_then = expected >= settings.least_expected
+        if not looked_then.any():
             continue
-        p_missed = p_hidden + (1.0 - p_hidden) * np.exp([log_missed[stamp] for stamp in enough.tolist()])
+        enough = stamp_s[looked_then]
+        hidden = np.where(along_clear >= settings.least_expected, p_hidden, p_hidden_unknown)[looked_then]
+        p_missed = hidden + (1.0 - hidden) * np.exp(log_missed[looked_then] / settings.sticky)
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
-        p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * p_hidden)
+        p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * hidden.min())
         at = int(np.flatnonzero(p_after >= settings.sure).max(initial=0))
         looked[k], p_appeared[k] = enough[at], p_after[at]
     return Arrivals(new, looked, p_appeared)
@@ -381,12 +427,14 @@ class _Rays:
 
 def _empty_looks(
     views: Views, rays: _Rays, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor, settings: LooksConfig
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Frames of earlier views that would have shown a place, its detection rate in them, and when they were."""
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Frames of earlier views that would have shown a place, its detection rate in them, when they were, and whether
+    the place is seen along their lines now.
+    """
     pose = views.pose
     near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf)
-    near = near <= settings.near_m
-    near |= rays.pass_by(pose[:, :2], place_m, settings)
+    is_clear = near <= settings.near_m
+    near = is_clear | rays.pass_by(pose[:, :2], place_m, settings)
     pose = pose[near]
     half, field = np.pi / HEADINGS, NominalField(sensor, settings)
     rate = np.min(
@@ -395,7 +443,7 @@ def _empty_looks(
         initial=1.0,
     )
     good = field.worth_a_look(rate)
-    return views.frames[near][good], rate[good], views.stamp_s[near][good]
+    return views.frames[near][good], rate[good], views.stamp_s[near][good], is_clear[near][good]
 
 
 def weigh_misses(

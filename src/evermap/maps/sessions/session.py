@@ -305,7 +305,7 @@ def judged(
     watch = known.watch if known is not None and known.entry.has_places_of(entry) else visit.watched(entry, config)
     seen = looked_at(entry.living, entry.p_start, watch, config)
     now = believe.believed(entry, seen, sensor, span_s, config)
-    came = arrivals(entry.before, entry.living, now.until_s, seen, sensor, config.looks)
+    came = arrivals(entry.before, entry.living, now.until_s, seen, sensor, config)
     came = follow_occupants(came, now, entry)
     if len(visit.witnessed.landmark_id):
         came = arrived(came, visit.witnessed, entry)
@@ -339,14 +339,17 @@ def missed(living: LivingMap, p_site: FloatArray, seen: PlaceLooks, visit: Visit
 def learned(judged: Judged, classes: ClassLives | None, config: LivingConfig) -> LivingMap:
     """Return the map after a session, with what it taught of lifetimes, and of from where places are seen."""
     after, seen = judged.living, judged.seen
-    lines, views = after.sightlines if config.learn_sight else judged.entry.before.sightlines, after.views
+    lines = after.sightlines if config.learn_sight else judged.entry.before.sightlines
+    views, glimpses = after.views, after.glimpses
     if config.learn_sight and config.existence:
         places = judged.entry.living.places
         weight = np.where(seen.settled, 1.0, judged.now.sites.p_here[seen.rows.site])
         names = places.site_id, places.landmark_id
         lines = lines.learned(names, seen.place, seen.cell, seen.rows.hit, weight, seen.rate)
         views = views.seen_from(judged.watch.eye, after.stamp_s, seen.rate)
-    return replace(after, sightlines=lines, views=views, lives=after.lives if classes is None else classes.lives)
+        glimpses = glimpses.joined(judged.watch.glimpsed_m, after.stamp_s)
+    lives = after.lives if classes is None else classes.lives
+    return replace(after, sightlines=lines, views=views, glimpses=glimpses, lives=lives)
 
 
 def told(judged: Judged, living: LivingMap, where: Laid | None, visit: Visit) -> Session:

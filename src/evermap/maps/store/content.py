@@ -54,7 +54,8 @@ _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
           "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
           "metres.log_metre", "metres.log_variance", "metres.information", "traits.landmark_id",
-          "traits.column_id", "traits.value", "traits.sessions", "renamed.landmark_id", "renamed.name")  # fmt: skip
+          "traits.column_id", "traits.value", "traits.sessions", "renamed.landmark_id", "renamed.name",
+          "glimpses.position_m", "glimpses.stamp_s")  # fmt: skip
 """Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -316,7 +317,10 @@ def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
     return {name, *(name_of(part) for names in listed for part in names)}
 
 
-_TABLES = ("members", "sites", "places", "stays", "dated", "boxes", "traits", "metres", "lives", "sightlines", "views")
+_TABLES = (
+    "members", "sites", "places", "stays", "dated", "boxes", "traits", "metres", "lives", "sightlines", "views",
+    "glimpses",
+)  # fmt: skip
 _LEAST = {
     "members.class_id": UNKNOWN, "stays.class_id": UNKNOWN, "lives.class_id": UNKNOWN, "lives.prior_class_id": UNKNOWN,
     "members.clique_id": 0, "sites.clique_id": 0, "stays.clique_id": 0, "sites.site_id": 0, "stays.site_id": 0,
@@ -332,7 +336,8 @@ _FINITE = (
     "places.position_m", "stays.position_m", "log_size_variance", "dated.stamp_s", "lives.chunk_m",
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
     "boxes.size_m", "traits.value", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
-    "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance",
+    "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance", "glimpses.position_m",
+    "glimpses.stamp_s",
 )  # fmt: skip
 _NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "stamp_s", "session_start_s")
 _PROBABILITIES = ("sites.p_here", "sites.p_kept", "stays.p_gone")
