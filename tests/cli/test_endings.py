@@ -31,6 +31,7 @@ GROUPS = {
         "unpin",
         "delete",
         "undelete",
+        "rename",
     ],
     "serve": ["token", "doctor"],
     "survival": ["plot", "fit", "learn"],

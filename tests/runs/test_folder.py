@@ -289,6 +289,7 @@ def test_changes_and_alternatives_are_kept_in_every_form(run, tmp_path):
         "stamp_from_s": None,
         "stamp_to_s": result.trajectory.stamp_s[0],
         "displacement_m": [-1.0, 0.0],
+        "displacement_covariance_m2": None,
         "rotation_rad": 0.0,
         "probability": 0.97,
         "hits": 0,

@@ -78,7 +78,8 @@ def test_the_map_says_whether_a_state_is_needed(alone: Solved) -> None:
     off = same.estimate.states - same.problem.prior.mean
     assert np.all(variance[2:4] <= 4.0 * spread[2:4] + off[2:4] ** 2 + 1e-6)
     reading = doubted.problem.reading - [0.12, 0.0]
-    nearer = replace(doubted, problem=replace(doubted.problem, reading=reading))
+    problem, noise = replace(doubted.problem, reading=reading), doubted.smoother.noise
+    nearer = replace(doubted, smoother=doubted.smoother.under(noise, heavy=doubted.smoother.heavy, problem=problem))
     moved, _ = in_map(alone, nearer, row, place_m)
     assert moved.p_needed[0] > 0.99
     assert moved.estimate.states[0] == pytest.approx(same.estimate.states[0] - 0.12, abs=0.02)
