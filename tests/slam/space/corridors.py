@@ -107,7 +107,7 @@ def tagged_corridor(
     said = identity[tag]
     wrong = random.random(len(tag)) < p_wrong
     said = np.where(wrong, identity[random.integers(0, n_tags, len(tag))], said)
-    detections = _detections(frame, said, corner)
+    detections = corner_detections(frame, said, corner)
     pose = poses(at, turn)
     driven = _drifting(pose, stamp_s, drift, random) if odometry else None
     truth = Trajectory(stamp_s, pose, np.zeros((n_frames, 6, 6)), frame="truth")
@@ -170,13 +170,13 @@ class Site:
             f"day {day}",
             None if driven is None else replace(driven, stamp_s=then),
             Frames(then),
-            _detections(frame, said, corner),
+            corner_detections(frame, said, corner),
             (CAMERA,),
             Trajectory(then, pose, np.zeros((n_frames, 6, 6)), frame="truth"),
         )
 
 
-def _detections(frame: np.ndarray, said: np.ndarray, corner: np.ndarray) -> SpatialDetections:
+def corner_detections(frame: np.ndarray, said: np.ndarray, corner: np.ndarray) -> SpatialDetections:
     count = len(frame)
     return SpatialDetections(
         frame=frame,

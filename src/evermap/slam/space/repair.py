@@ -13,12 +13,14 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
-from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, oriented
+from evermap.slam.space.estimate import MOST_CANDIDATES, SpatialOptimum, as_seen, converged, oriented
 from evermap.slam.space.linearise import linearise_sightings
 from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.starts import located_again
 from evermap.types import BoolArray, FloatArray, IntArray
 
+MOST_TURNED = 6
+"""Places whose other orientation is tried in a round, at most."""
 ROUNDS = 3
 """Times that other explanations are tried, at most."""
 STEPS, ENDING = 20, 0.1
@@ -44,9 +46,47 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
             )
             if there.cost < optimum.now.cost - gain_nats:
                 optimum = converged(problem, found, optimum.noise, heavy_rounds=0)
-        if optimum is before:
+        if optimum is before and (optimum := _with_one_turned(optimum)) is before:
             break
     return optimum
+
+
+def _with_one_turned(optimum: SpatialOptimum) -> SpatialOptimum:
+    """Return the optimum, or a better one in which a place has the other orientation that explains its views.
+
+    Poses from which little else is seen follow a wrong orientation, so that no vote at their optimum tells of it.
+    """
+    smoother, noise, gain_nats = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
+    starts = [replace(optimum.estimate, place=place) for place in _turned_places(optimum)]
+    cost = [smoother.linearised(start, noise, heavy=False).cost for start in starts]
+    for k in np.argsort(cost, kind="stable")[:MOST_TURNED].tolist():
+        wanted = optimum.now.cost - gain_nats
+        found, there = smoother.optimum(
+            starts[k], noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats, wanted=wanted
+        )
+        if there.cost < wanted:
+            return converged(smoother.problem, found, noise, heavy_rounds=0)
+    return optimum
+
+
+def _turned_places(optimum: SpatialOptimum) -> list[FloatArray]:
+    """Return places (P, 7), in each of which one is turned as its views say by the explanation that is not taken."""
+    problem, estimate, weight = optimum.smoother.problem, optimum.estimate, optimum.now.weight
+    sigma = np.hypot(problem.sigma_rad * optimum.noise.pixel, problem.settings.repair.same_rad)
+    both = np.stack([as_seen(problem, estimate, measured) for measured in problem.either])
+    angle = se3.angle_between(both, estimate.place[problem.place])
+    other = np.where((angle[0] < angle[1])[:, None], both[1], both[0])
+    asked = np.isfinite(problem.other[:, 3]) & problem.oriented[problem.place]
+    found = list[FloatArray]()
+    for place in np.unique(problem.place[asked]).tolist():
+        mine = np.flatnonzero(asked & (problem.place == place))
+        mine = mine[:: max(1, len(mine) // MOST_CANDIDATES)]
+        off = se3.angle_between(other[mine, None], other[mine]) / sigma[mine]
+        best = mine[int(np.argmax(np.exp(-0.5 * off**2) @ weight[mine]))]
+        turned = estimate.place.copy()
+        turned[place, 3:] = other[best, 3:]
+        found.append(turned)
+    return found
 
 
 def _located_again(optimum: SpatialOptimum) -> SpatialEstimate | None:

@@ -33,7 +33,7 @@ from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
 from evermap.slam.space.map_consensus import cost_in_map, start_by_consensus
 from evermap.slam.space.marginal import log_marginal_likelihood
-from evermap.slam.space.moved_within import MovedWithin, superseded
+from evermap.slam.space.moved_within import MovedWithin, list_movers, superseded
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.smoother import SpatialSmoother
@@ -59,8 +59,8 @@ MOST_DRIFT, INDEPENDENT = 3.0, 0.2
 and correlation of consecutive residuals of a landmark, up to which these are independent."""
 STRIDES, SAME_METRE = 20, 0.03
 """Shares of a drive whose ways are compared, the longer half, and by which these differ at most, in the median."""
-SEEDS = 3
-"""Frames from which constellations are begun."""
+SEEDS, STEPS_OF_START = 3, 10
+"""Frames from which constellations are begun, and Gauss-Newton steps by which starts are compared."""
 LOOSE = 1.5
 """Numbers measured for each that is sought, up to which views are loosely tied."""
 WIDER, STEPS_OF_WIDER = (30.0, 10.0, 3.0), 20
@@ -140,7 +140,7 @@ def solve_space(
         _, estimate = _likeliest(problem.as_points(), noise, [stepwise, whole])
         points = converged(problem.as_points(), estimate, noise)
         if of_points and not problem.steady and _is_doubtful(points):
-            points = _or_better(points, by_constellations(problem, points.noise, SEEDS))
+            points = _or_better(points, by_constellations(problem.as_points(), points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
@@ -149,6 +149,11 @@ def solve_space(
         if _is_loosely_tied(problem):
             begun = converged(problem, estimate, noise)
             estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
+    else:
+        begun = converged(problem, stepwise, noise)
+        if _is_doubtful(begun) or _has_movers(begun):
+            begun = _or_best(begun, by_constellations(problem, noise, SEEDS))
+        estimate, noise = begun.estimate, begun.noise
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delays = with_delays(converged(problem, estimate, noise))
     if len(stated) and of_points and not problem.driven and (_is_doubtful(optimum) or has_contradictions(optimum)):
@@ -416,6 +421,13 @@ def _is_doubtful(optimum: SpatialOptimum) -> bool:
     return bool(jumps or lost_frames(optimum.smoother.problem, optimum.now.weight).any())
 
 
+def _has_movers(optimum: SpatialOptimum) -> bool:
+    """Tell whether landmarks have outliers in a row: they moved during the session, or the start led nowhere."""
+    count = len(optimum.smoother.problem.oriented)
+    everyone, none = np.ones(count, dtype=np.bool_), np.zeros(0, dtype=np.int64)
+    return len(list_movers(optimum, np.arange(count), everyone, none)) > 0
+
+
 def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> SpatialOptimum:
     """Return the optimum, or a more probable one from another start, at the same noise."""
     smoother, noise, gain = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
@@ -428,11 +440,26 @@ def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> Spatia
     return optimum
 
 
+def _or_best(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> SpatialOptimum:
+    """Return the optimum, or that from the start which leads to the most probable values at the same noise."""
+    smoother, noise, gain = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
+    best, wanted = None, optimum.now.cost - gain
+    for start in starts:
+        found, _ = smoother.optimum(start, noise, heavy=True, iterations=STEPS_OF_START)
+        found, there = smoother.optimum(found, noise, heavy=False, iterations=STEPS_OF_START, wanted=wanted)
+        if there.cost < wanted:
+            best, wanted = found, there.cost
+    return optimum if best is None else converged(smoother.problem, best, noise)
+
+
 def _likeliest(
     problem: SpatialProblem, noise: SpatialNoise, starts: list[SpatialEstimate]
 ) -> tuple[SpatialEstimate, SpatialEstimate]:
     """Return the initial values that lead to the most probable ones, and these."""
-    found = [SpatialSmoother(problem, start.pose).optimum(start, noise, heavy=True, iterations=10) for start in starts]
+    found = [
+        SpatialSmoother(problem, start.pose).optimum(start, noise, heavy=True, iterations=STEPS_OF_START)
+        for start in starts
+    ]
     cost = [now.cost for _, now in found]
     best = len(starts) - 1 - int(np.argmin(cost[::-1]))  # of equal ones the last
     return starts[best], found[best][0]
