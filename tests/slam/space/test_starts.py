@@ -199,6 +199,7 @@ def test_an_orientation_is_known_once_its_views_leave_no_other():
         known=np.zeros(1, dtype=np.bool_),
         place=se3.NO_TURN[None].copy(),
         spread=np.zeros(1),
+        other_rad=0.3,
     )
     true, mirrored, another = (se3.exp(np.append(np.zeros(3), by)) for by in ([0, 0.4, 0], [0, -0.4, 0], [0.9, 0.4, 0]))
     turn.seen[:, 0], turn.seen[:, 1] = (true, mirrored), (another, true)

@@ -42,8 +42,6 @@ ANYWHERE = 1e-8
 """Information on a pose of which nothing is known [1/m^2, 1/rad^2]."""
 SLACK_RAD = 0.02
 """And of known orientations [rad]."""
-SAME_RAD = 0.3
-"""Orientations that are further apart are two explanations [rad]."""
 LEAD = 3.0
 """Nats by which an orientation must be ahead of any other to be known."""
 UNLIKELY = 1e-6
@@ -67,6 +65,7 @@ class _Turns:
         known: (P,) places with an orientation.
         place: (P, 4) these.
         spread: (P,) and their variances [rad^2].
+        other_rad: orientations that are further apart are two explanations [rad].
     """
 
     gives: BoolArray
@@ -76,6 +75,7 @@ class _Turns:
     known: BoolArray
     place: FloatArray
     spread: FloatArray
+    other_rad: float
 
     @classmethod
     def of(cls, problem: SpatialProblem, noise: SpatialNoise, mount: FloatArray) -> _Turns:
@@ -91,9 +91,12 @@ class _Turns:
         prior, stands = problem.prior, problem.prior.weight > problem.settings.inlier
         place[prior.place], spread[prior.place] = prior.pose[:, 3:], prior.sigma[:, 3:].max(axis=1) ** 2
         known[prior.place[stands]] = problem.oriented[prior.place[stands]]
-        known &= spread < SAME_RAD**2
+        other_rad = problem.settings.repair.other_rad
+        known &= spread < other_rad**2
         seen = se3.compose(mount, np.where(gives[:, None], problem.either, se3.identity()))
-        return cls(gives, seen, log_share, np.where(gives, sigma, 1.0) ** 2 + SLACK_RAD**2, known, place, spread)
+        return cls(
+            gives, seen, log_share, np.where(gives, sigma, 1.0) ** 2 + SLACK_RAD**2, known, place, spread, other_rad
+        )
 
     def surely(self, place: IntArray) -> BoolArray:
         """Return (M,) detections of one orientation, of places (M,) whose orientation is known."""
@@ -127,7 +130,7 @@ class _Turns:
         each = (share * np.exp(-0.5 * angle**2 / variance)).sum(axis=1)
         score = np.log(each + UNLIKELY).sum(axis=1)
         best = int(np.argmax(score))
-        away = se3.angle_between(candidate, candidate[best]) > SAME_RAD
+        away = se3.angle_between(candidate, candidate[best]) > self.other_rad
         self.known[place] = bool(score[best] - score[away].max(initial=-np.inf) > LEAD)
         nearest = np.argmin(angle[best], axis=0)
         near = angle[best][nearest, np.arange(len(mine))] ** 2 < OUTLIER * variance
