@@ -207,6 +207,19 @@ def test_lengths_in_space_are_asked() -> None:
     assert own.shift > 0.5
 
 
+def test_what_has_no_metre_is_asked_no_scale() -> None:
+    """Without odometry a smaller world is as probable, and a slower walk more so."""
+    driven = World(seconds=2.0).space()
+    carried = replace(driven, odometry=None)
+
+    def lengths(recording: AnyRecording, given: Landmarks | None) -> set[str]:
+        return {one.subject for one in list_suspects(Inputs.of(recording, given))} & {"all tags", "sensor"}
+
+    assert lengths(driven, None)
+    assert not lengths(carried, None)
+    assert lengths(carried, driven.true_landmarks)
+
+
 def test_a_score_does_not_depend_on_the_step_of_its_differences(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = mounts(World(seed=1).space(), lambda at: at + [0.02, 0, 0, 0, 0, 0, 0])
     found = scored(recording, World().map_in_space())

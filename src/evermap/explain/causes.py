@@ -150,7 +150,8 @@ def list_suspects(inputs: Inputs, *, calibrations: bool = False) -> tuple[Suspec
     """
     recording, found = inputs.recording, list[Suspect]()
     if is_in_space(recording):
-        found += _in_space(recording, calibrations=calibrations)
+        has_metre = bool(recording.odometry is not None or inputs.prior_map is not None or recording.measurements)
+        found += _in_space(recording, calibrations=calibrations, has_metre=has_metre)
     else:
         found += _in_plane(recording, calibrations=calibrations)
     if inputs.prior_map is not None:
@@ -383,13 +384,19 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
 # ---- in space
 
 
-def _in_space(recording: SpatialRecording, *, calibrations: bool) -> Iterable[Suspect]:
+def _in_space(recording: SpatialRecording, *, calibrations: bool, has_metre: bool) -> Iterable[Suspect]:
+    """Yield what may be wrong with a recording in space; no scale of all that was seen where nothing else has a metre.
+
+    A smaller world fits as well then, and better with what is supposed of how fast a camera is carried.
+    """
     seen, sensors = recording.detections, recording.sensors
     sizes = np.unique(np.round(seen.tag_size_m[np.isfinite(seen.tag_size_m)], 6))
     one = f"{sizes[0]:.12g}" if len(sizes) == 1 else ""
     corners = bool(np.isfinite(seen.corner_px[:, 0, 0]).any())
     many = len(sensors) > 1
-    if one or corners:
+    if not has_metre:
+        pass
+    elif one or corners:
         yield _all_tags(one)
     else:
         yield Suspect(
