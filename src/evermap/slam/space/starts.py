@@ -393,7 +393,7 @@ def _grow(growth: _Growth) -> None:
 
     Of very many frames some are located, and the others by the motion from the nearest of these.
     """
-    left_out = ~_sampled(growth)
+    left_out = ~_choose_frames(growth)
     surely, failed = True, np.zeros(len(growth.located), dtype=np.bool_)
     while not (growth.located | left_out).all():
         unsure = np.where(failed | left_out, np.inf, growth.uncertainty(growth.information()))
@@ -424,10 +424,10 @@ def _grow(growth: _Growth) -> None:
         growth.place_seen(rest[growth.located[rest]])
 
 
-def _sampled(growth: _Growth) -> BoolArray:
-    """(N,) frames to locate: all, or of each stretch of very many the one that sees most; and those located."""
+def _choose_frames(growth: _Growth) -> BoolArray:
+    """Return (N,) frames to locate: all, or of each stretch of very many the one that sees most; and those located."""
     n = len(growth.located)
-    if n <= MOST_GROWN:
+    if n - np.count_nonzero(growth.located) <= MOST_GROWN:
         return np.ones(n, dtype=np.bool_)
     seen, stretch = np.diff(growth.first), np.arange(n) * MOST_GROWN // n
     order = np.lexsort((-seen, stretch))
@@ -502,7 +502,7 @@ def _refined(
     Of more than `FEW` poses those that cost the least are refined, after one step of each.
     """
     for k in range(REFINED + 1):
-        information, right, cost, squared = _pulled(pose, point, covariance, place, spread, mean, told, turns)
+        information, right, cost, squared = _linearise_poses(pose, point, covariance, place, spread, mean, told, turns)
         if k == REFINED:
             break
         if k == 1 and len(pose) > FEW:
@@ -513,12 +513,14 @@ def _refined(
         step *= np.minimum(1.0, 0.5 / np.maximum(size, 1e-9))[:, None]
         pose = se3.retract(pose, step)
         if k > 0 and np.abs(step).max() < SETTLED:
-            information, right, cost, squared = _pulled(pose, point, covariance, place, spread, mean, told, turns)
+            information, right, cost, squared = _linearise_poses(
+                pose, point, covariance, place, spread, mean, told, turns
+            )
             break
     return pose, cost, information, squared
 
 
-def _pulled(
+def _linearise_poses(
     pose: FloatArray, point: FloatArray, covariance: FloatArray, place: FloatArray, spread: FloatArray,
     mean: FloatArray, told: FloatArray, turns: _SeenTurns,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
