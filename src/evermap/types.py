@@ -172,6 +172,12 @@ def is_text_of(name: str, landmark_id: int) -> bool:
     return not is_number(landmark_id) and landmark_id_of(name) == landmark_id
 
 
+def identity_text(landmark_id: int, names: Mapping[int, str]) -> str:
+    """Return an identity as tables have it, by which it is read again: its text if it is one, else its number."""
+    name = names.get(landmark_id)
+    return name if name is not None and is_text_of(name, landmark_id) else str(landmark_id)
+
+
 class Clock(StrEnum):
     """Clock of stamps. Stamps of different clocks are never compared."""
 

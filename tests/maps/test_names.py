@@ -20,7 +20,7 @@ from evermap.io import read_prior_map
 from evermap.io.map_formats import format_called, write_map
 from evermap.maps.diff import diff
 from evermap.maps.living import LivingMap
-from evermap.maps.names import MOST, Renamed, anonymous_text, distinct_text, given_names
+from evermap.maps.names import MOST, Renamed, anonymous_text, distinct_text, name_landmarks
 from evermap.maps.store import Provenance, open_store
 from evermap.maps.store.content import pack
 from evermap.maps.why import why
@@ -32,7 +32,7 @@ START_S = 1704105328.074
 
 def names(texts: Sequence[str], renamed: Renamed = Renamed()) -> list[str]:  # noqa: B008
     """What landmarks with these texts are called, in their order."""
-    found = given_names(tuple(sorted(texts)), renamed)
+    found = name_landmarks(tuple(sorted(texts)), renamed)
     return [found[landmark_id_of(text)] for text in texts]
 
 

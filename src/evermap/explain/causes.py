@@ -394,11 +394,9 @@ def _in_space(recording: SpatialRecording, *, calibrations: bool, has_metre: boo
     one = f"{sizes[0]:.12g}" if len(sizes) == 1 else ""
     corners = bool(np.isfinite(seen.corner_px[:, 0, 0]).any())
     many = len(sensors) > 1
-    if not has_metre:
-        pass
-    elif one or corners:
+    if has_metre and (one or corners):
         yield _all_tags(one)
-    else:
+    elif has_metre:
         yield Suspect(
             "range-scale", "sensor", USUAL_P, partial(_stretch_positions, of=None),
             lambda s: f"true distances are {math.exp(s):.4g} times those of the detections: the detector has another "

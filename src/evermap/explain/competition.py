@@ -329,10 +329,8 @@ def _find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
     """
     if is_in_space(inputs.recording):
         return None
-    delay, least_s = (
-        find_odometry_delay(result),
-        LEAST_LATE_S if inputs.recording.odometry.is_measured else LONGEST_LEAD_S,
-    )
+    delay = find_odometry_delay(result)
+    least_s = LEAST_LATE_S if inputs.recording.odometry.is_measured else LONGEST_LEAD_S
     if delay is None or not (delay.p_needed > SURE and -delay.value > max(least_s, SURELY * delay.sigma)):
         return None
     suspect = next(one for one in list_suspects(inputs, calibrations=True) if one.code == CLOCK)

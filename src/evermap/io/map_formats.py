@@ -75,7 +75,7 @@ from evermap.io.tag_maps import (
     wpilib_text,
 )
 from evermap.io.text import decode_text
-from evermap.types import Clock, Landmarks, is_number, is_text_of
+from evermap.types import Clock, Landmarks, identity_text, is_number
 
 _Z_UP = {"up": {"direction": [0.0, 0.0, 1.0], "sigma_rad": 0.01, "source": "stated"}}
 """Of formats that say so."""
@@ -419,13 +419,6 @@ def _correct_parquet(file: SurveyFile, corrections: Sequence[Correction]) -> byt
     return bytes(sink.getvalue().to_pybytes())
 
 
-def _texts_of(landmarks: Landmarks) -> list[str]:
-    """Return identities (L,) by which the map is read again: texts of those that have one, else numbers."""
-    names = landmarks.names
-    every = landmarks.landmark_id.tolist()
-    return [names[one] if one in names and is_text_of(names[one], one) else str(one) for one in every]
-
-
 def _csv_of(landmarks: Landmarks) -> str:
     return csv_text(map_columns(landmarks))
 
@@ -436,7 +429,8 @@ def _parquet_of(landmarks: Landmarks) -> bytes:
 
 def _columns_of(landmarks: Landmarks) -> str:
     """Ids as numbers or texts, coordinates, and quaternions where there are any."""
-    columns: dict[str, Any] = {"id": _texts_of(landmarks), **dict(zip("xyz", landmarks.position_m.T, strict=False))}
+    ids = [identity_text(one, landmarks.names) for one in landmarks.landmark_id.tolist()]
+    columns: dict[str, Any] = {"id": ids, **dict(zip("xyz", landmarks.position_m.T, strict=False))}
     if landmarks.rotation is not None:
         columns |= dict(zip(QUATERNION, landmarks.rotation.T, strict=True))
     return csv_text(columns)

@@ -32,6 +32,7 @@ from evermap.types import (
     SpatialOdometry,
     SpatialRecording,
     Trajectory,
+    identity_text,
     is_in_space,
     is_text_of,
 )
@@ -237,10 +238,9 @@ def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[s
 
 def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     """Return a column of ids: as numbers, or as text if any id is one; other names would be read as other ids."""
-    texts = {one: names[one] for one in {*landmark_id.tolist()} & names.keys() if is_text_of(names[one], one)}
-    if not texts:
+    if not any(is_text_of(names[one], one) for one in {*landmark_id.tolist()} & names.keys()):
         return landmark_id
-    return ["" if number == UNKNOWN else texts.get(number, str(number)) for number in landmark_id.tolist()]
+    return ["" if number == UNKNOWN else identity_text(number, names) for number in landmark_id.tolist()]
 
 
 def _class_names(recording: Recording | SpatialRecording) -> tuple[str, ...]:

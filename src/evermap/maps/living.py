@@ -24,7 +24,7 @@ from evermap.config import LivingConfig
 from evermap.errors import InputError
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
-from evermap.maps.names import Renamed, given_names, landmark_with, rename
+from evermap.maps.names import Renamed, landmark_with, name_landmarks, rename
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import Glimpses, SightLines, Views, pair_rows
 from evermap.show import Shown, draw
@@ -396,11 +396,11 @@ class LivingMap(Shown):
     @property
     def landmark_names(self) -> dict[int, str]:
         """Names of landmarks that are called by more than a number, by their ids (`maps.names`)."""
-        return dict(given_names(self.landmark_texts, self.renamed))
+        return dict(name_landmarks(self.landmark_texts, self.renamed))
 
     def label(self, landmark_id: int) -> str:
         """Return what a landmark is called: its name, or its number."""
-        return landmark_label(landmark_id, given_names(self.landmark_texts, self.renamed))
+        return landmark_label(landmark_id, name_landmarks(self.landmark_texts, self.renamed))
 
     def landmark_called(self, name: str) -> int:
         """Return the id of a landmark by what it is or was called, or by its id in digits; -1 where that is neither."""

@@ -69,7 +69,7 @@ def distinct_text(text: str, taken: Collection[str]) -> str:
     return text if text not in taken else next(one for one in every if one not in taken)
 
 
-def given_names(texts: tuple[str, ...], renamed: Renamed) -> Mapping[int, str]:
+def name_landmarks(texts: tuple[str, ...], renamed: Renamed) -> Mapping[int, str]:
     """Return what landmarks are called that have a name, by their ids.
 
     Args:

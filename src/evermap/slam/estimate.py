@@ -73,16 +73,16 @@ class Solved:
         smoother = outcome.smoother
         earlier = replace(smoother.problem, stamp_s=prepared.problem.stamp_s[: len(smoother.problem.stamp_s)])
 
-        def delayed(estimate: Estimate) -> Estimate:
+        def delay(estimate: Estimate) -> Estimate:
             states = estimate.states.copy()
             states[DELAY] += by_s
             return replace(estimate, states=states)
 
         outcome = replace(
             outcome,
-            estimate=delayed(outcome.estimate),
+            estimate=delay(outcome.estimate),
             smoother=smoother.under(smoother.noise, heavy=smoother.heavy, problem=earlier),
-            graph_estimate=delayed(outcome.graph_estimate),
+            graph_estimate=delay(outcome.graph_estimate),
             revision=outcome.revision.earlier(by_s),
         )
         return replace(self, recording=recording, prepared=prepared, outcome=outcome)

@@ -92,11 +92,11 @@ def tagged_corridor(
     turn = Rotation.from_euler(
         "xyz", np.column_stack([0.05 * np.sin(stamp_s), 0.05 * np.cos(stamp_s), 0.2 * np.sin(0.5 * stamp_s)])
     )
-    frame, tag, corner = _seen(at, turn, place, facing)
+    frame, tag, corner = see_corners(at, turn, place, facing)
     for move in moves:
         of = np.arange(n_tags) == move.tag
         turned = facing * Rotation.from_rotvec(of[:, None] * [0.0, move.turn_rad, 0.0])
-        there = _seen(at, turn, place + of[:, None] * np.array(move.by_m), turned)
+        there = see_corners(at, turn, place + of[:, None] * np.array(move.by_m), turned)
         old = (tag != move.tag) | (stamp_s[frame] < move.at_s)
         new = (there[1] == move.tag) & (stamp_s[there[0]] >= move.at_s)
         parts = [np.concatenate([a[old], b[new]]) for a, b in zip((frame, tag, corner), there, strict=True)]
@@ -158,7 +158,7 @@ class Site:
         sway = np.column_stack([0.05 * np.sin(stamp_s), 0.05 * np.cos(stamp_s), 0.2 * np.sin(0.5 * stamp_s)])
         turn = Rotation.from_euler("xyz", sway)
         there = np.flatnonzero(self.present)
-        frame, tag, corner = _seen(at, turn, self.place[there], self.facing[there])
+        frame, tag, corner = see_corners(at, turn, self.place[there], self.facing[there])
         kept = random.random(len(frame)) < 0.9
         frame, tag, corner = frame[kept], there[tag[kept]], corner[kept] + random.normal(0, 0.3, corner[kept].shape)
         wrong = random.random(len(tag)) < p_wrong
@@ -237,18 +237,24 @@ def as_poses(world: World, seed: int, sigma_m: float = 0.01, sigma_rad: float = 
     return replace(recording, detections=detections)
 
 
-def _seen(
-    at: np.ndarray, turn: Rotation, place: np.ndarray, facing: Rotation
+def see_corners(
+    at: np.ndarray,
+    turn: Rotation,
+    place: np.ndarray,
+    facing: Rotation,
+    mount: Rotation = MOUNT,
+    mount_at: np.ndarray = MOUNT_AT,
+    nearest_m: float = 0.3,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frames, tags and exact corners of all sightings, by the pinhole formula."""
-    camera = (turn * MOUNT).inv().as_matrix()
-    origin = at + turn.apply(MOUNT_AT)
+    camera = (turn * mount).inv().as_matrix()
+    origin = at + turn.apply(mount_at)
     edge = place[:, None] + np.stack([facing.apply(corner) for corner in SQUARE], axis=1)
     ahead = np.einsum("fij,ftcj->ftci", camera, edge[None] - origin[:, None, None])
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel = FOCAL * ahead[..., :2] / ahead[..., 2:] + CENTRE
     inside = ((pixel > 0.0) & (pixel < 2.0 * np.array(CENTRE))).all(axis=(2, 3))
-    frame, tag = np.nonzero(inside & (ahead[..., 2].min(axis=2) >= 0.3))
+    frame, tag = np.nonzero(inside & (ahead[..., 2].min(axis=2) >= nearest_m))
     return frame, tag, pixel[frame, tag]
 
 

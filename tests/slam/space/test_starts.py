@@ -20,7 +20,7 @@ from evermap.slam.space.starts import by_constellations, located_again
 from evermap.types import FloatArray, SpatialRecording
 
 from .rigs import Rig
-from .walks import carried
+from .walks import make_walk
 
 SLACK_M = 0.002
 
@@ -118,7 +118,7 @@ def test_small_tags_without_odometry_are_mapped_as_from_the_truth(seed):
 
     Frame by frame in the order of time they were .67 m off (seed 0), and four of the tags 'moved' with .97 or more.
     """
-    world = carried(seed, n_tags=18, sigma_px=0.6, p_wrong=0.005)
+    world = make_walk(seed, n_tags=18, sigma_px=0.6, p_wrong=0.005)
     found, ours, least = solved(world.recording)
     assert ours < 1.05 * least + SLACK_M
     assert len(found.identity) == 18
@@ -127,7 +127,7 @@ def test_small_tags_without_odometry_are_mapped_as_from_the_truth(seed):
 
 def from_one_turned(seed: int, tag: int):
     """The optimum next to the truth, but for a tag that faces where its other explanation has it."""
-    world = carried(seed, n_tags=18, sigma_px=0.6)
+    world = make_walk(seed, n_tags=18, sigma_px=0.6)
     intake = prepare_space(world.recording, Config().slam.space)
     problem = intake.problem
     start = first_places(problem, true_poses(world.recording, intake))
@@ -172,17 +172,17 @@ def test_of_several_starts_the_most_probable_holds():
 
 
 def test_of_very_many_frames_some_are_located_and_the_others_led_along(monkeypatch):
-    world = carried(1, seconds=40.0)
+    world = make_walk(1, seconds=40.0)
     intake = prepare_space(world.recording, Config().slam.space)
     monkeypatch.setattr(starts, "MOST_GROWN", 100)
     located = list[int]()
     locate = starts._Growth.locate
 
-    def counted(self, row: int, *, surely: bool = True) -> bool:
+    def locate_and_count(self, row: int, *, surely: bool = True) -> bool:
         located.append(row)
         return locate(self, row, surely=surely)
 
-    monkeypatch.setattr(starts._Growth, "locate", counted)
+    monkeypatch.setattr(starts._Growth, "locate", locate_and_count)
     true = true_poses(world.recording, intake)
     found = by_constellations(intake.problem, starts_noise(intake.problem), 1)[0]
     assert len(set(located)) <= 100 < len(true)
@@ -217,7 +217,7 @@ def test_an_orientation_is_known_once_its_views_leave_no_other():
 
 def test_a_tag_that_is_known_locates_a_frame_by_itself():
     """Position and orientation follow from it alone, and the frame is as certain as the orientation that it sees."""
-    world = carried(2, n_tags=18, seconds=20.0, sigma_px=0.05)
+    world = make_walk(2, n_tags=18, seconds=20.0, sigma_px=0.05)
     intake = prepare_space(world.recording, Config().slam.space)
     problem, true = intake.problem, true_poses(world.recording, intake)
     growth = starts._Growth.of(problem, replace(starts_noise(problem), pixel=0.05))

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from evermap.types import Frames, Landmarks, SpatialRecording, SpatialSensor, Trajectory
 
-from .corridors import CENTRE, FOCAL, INTRINSICS, SQUARE, World, corner_detections, poses
+from .corridors import INTRINSICS, World, corner_detections, poses, see_corners
 
 AHEAD = Rotation.from_matrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 """Of the camera: its z is the robot's x."""
@@ -16,7 +16,7 @@ ROOM_M, RANGE_M, FACED = np.array([6.5, 6.0, 2.5]), 6.0, 0.35
 """Size of the room; how far, and at which cosine between the line of sight and what a tag faces, it is detected."""
 
 
-def carried(
+def make_walk(
     seed: int,
     *,
     n_tags: int = 24,
@@ -48,7 +48,12 @@ def carried(
     )
     yaw = 2.0 * np.pi * stamp_s / 50.0 + 0.3 * np.sin(stamp_s)
     turn = Rotation.from_euler("ZYX", np.column_stack([yaw, 0.15 * np.sin(stamp_s / 2.0), 0.1 * np.sin(stamp_s / 1.7)]))
-    frame, tag, corner = _seen(at, turn, place, facing)
+    frame, tag, corner = see_corners(at, turn, place, facing, AHEAD, np.zeros(3), nearest_m=0.2)
+    ray = at[frame] - place[tag]
+    away = np.linalg.norm(ray, axis=1)
+    faced = np.einsum("ni,ni->n", ray, facing[tag].apply([0.0, 0.0, 1.0])) / away
+    near = (away < RANGE_M) & (faced > FACED)
+    frame, tag, corner = frame[near], tag[near], corner[near]
     kept = random.random(len(frame)) < 0.9
     frame, tag, corner = frame[kept], tag[kept], corner[kept] + random.normal(0.0, sigma_px, corner[kept].shape)
     wrong = random.random(len(tag)) < p_wrong
@@ -72,20 +77,3 @@ def _tags(random: np.random.Generator, count: int) -> tuple[np.ndarray, Rotation
     upright = Rotation.from_matrix(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
     inwards = Rotation.from_rotvec(np.outer(np.pi + 0.5 * np.pi * wall, [0.0, 0.0, 1.0]))
     return np.column_stack([xy, random.uniform(-1.0, 1.0, count)]), inwards * upright
-
-
-def _seen(
-    at: np.ndarray, turn: Rotation, place: np.ndarray, facing: Rotation
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frames, tags and exact corners of all sightings, by the pinhole formula."""
-    camera = (turn * AHEAD).inv().as_matrix()
-    edge = place[:, None] + np.stack([facing.apply(corner) for corner in SQUARE], axis=1)
-    ahead = np.einsum("fij,ftcj->ftci", camera, edge[None] - at[:, None, None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = FOCAL * ahead[..., :2] / ahead[..., 2:] + CENTRE
-    ray = at[:, None] - place
-    away = np.linalg.norm(ray, axis=2)
-    faced = np.einsum("ftj,tj->ft", ray, facing.apply([0.0, 0.0, 1.0])) / away
-    inside = ((pixel > 0.0) & (pixel < 2.0 * np.array(CENTRE))).all(axis=(2, 3)) & (ahead[..., 2].min(axis=2) > 0.2)
-    frame, tag = np.nonzero(inside & (away < RANGE_M) & (faced > FACED))
-    return frame, tag, pixel[frame, tag]

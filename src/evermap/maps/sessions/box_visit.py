@@ -198,10 +198,10 @@ class BoxVisit(SpatialVisit):
         if len(self.tied_m):
             away = np.linalg.norm(watch.eye[:, None, :2] - self.tied_m, axis=2).min(axis=1)
             shown &= hit | (away <= settings.tied_m)[listed.pose]
-        glimpsed_m = self._unassigned(rows, at[:, :2], settings)
+        glimpsed_m = self._find_glimpses(rows, at[:, :2], settings)
         return watch._replace(listed=listed._replace(hit=hit).rows(shown), glimpsed_m=glimpsed_m)
 
-    def _unassigned(self, rows: IntArray, at_m: FloatArray, settings: BoxesConfig) -> FloatArray:
+    def _find_glimpses(self, rows: IntArray, at_m: FloatArray, settings: BoxesConfig) -> FloatArray:
         """Of boxes, rows (N,) at (N, 2), the positions (K, 2) of those that may stand, but are of no landmark of the
         map, and of none that was seen to leave: where there are several; one alone may be a wrong box.
         """
