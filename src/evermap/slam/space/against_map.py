@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import MapInSpaceConfig
+from evermap.estimate.sparse.elimination import numbers_of
 from evermap.geometry import se2, se3
 from evermap.slam.changes.evidence import WindowEvidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import PLACES, POINTS
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
-from evermap.slam.space.range_errors import find_range_errors, shows_errors
+from evermap.slam.space.range_errors import consider_range_errors, find_range_errors, shows_errors
 from evermap.types import FloatArray, IntArray
 
 ROUNDS = 12
@@ -291,7 +292,9 @@ def by_itself(optimum: SpatialOptimum) -> Alone:
     rows, shift = se2.xy_rows(seen, 3), np.zeros((count, 3))
     covariance = np.eye(3 * count) / LOOSE
     if not len(problem.prior.place):
-        covariance[np.ix_(rows, rows)] = onto @ joint @ onto.T
+        tree = optimum.smoother.structure.system.tree
+        of_ranges = consider_range_errors(optimum)[numbers_of(tree.begin[n + seen], tree.dim[n + seen])]
+        covariance[np.ix_(rows, rows)] = onto @ (joint + of_ranges @ of_ranges.T) @ onto.T
         return Alone(shift, covariance, rotation)
     values, vectors, pull = _without_map(optimum, joint, seen, first)
     told = values > LOOSE

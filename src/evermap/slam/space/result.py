@@ -32,6 +32,7 @@ from evermap.slam.space.linearise import (
 )
 from evermap.slam.space.moved_within import MovedWithin
 from evermap.slam.space.problem import SpatialNoise, SpatialProblem
+from evermap.slam.space.range_errors import consider_range_errors
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
 from evermap.slam.space.up import Movement, decide_up
@@ -81,7 +82,14 @@ class _Told:
     frame: str
     stamp_s: FloatArray
     placed: BoolArray
+    of_ranges: FloatArray
     up: Up = field(default_factory=Up)
+
+    def considered(self, variable: IntArray, dim: int) -> FloatArray:
+        """Return (K, dim, dim) what errors of ranges add to the covariances of variables (K,)."""
+        begin = self.solved.optimum.smoother.structure.system.tree.begin[variable]
+        own = self.of_ranges[begin[:, None] + np.arange(dim)]
+        return np.asarray(own @ np.swapaxes(own, 1, 2))
 
 
 def concluded_in_space(
@@ -93,7 +101,8 @@ def concluded_in_space(
     found, placed = located(problem, optimum.now)
     placed &= ~solved.left
     spread = optimum.smoother.spread(optimum.now)
-    told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed)
+    of_ranges = consider_range_errors(optimum)
+    told = _Told(recording, intake, solved, problem, spread, frame, intake.start_s + problem.stamp_s, placed, of_ranges)
     motion = Movement.of(told.stamp_s, problem, optimum.estimate, recording.sensors, found, placed)
     up, disagree = decide_up(motion, recording.odometry, recording.measurements, problem.settings.up)
     told = replace(told, up=up)
@@ -132,6 +141,7 @@ def _trajectory(told: _Told, found: BoolArray) -> Trajectory:
     pose = bridge(frames, problem, optimum.estimate, optimum.noise)
     noise, weight = optimum.sober or optimum.noise, optimum.now.odometry_weight
     covariance = bridge_covariance(frames, problem, optimum.estimate, noise, weight, told.spread)
+    covariance += told.considered(frames.before, 6)
     covariance = add_scale_error(covariance, -se3.inverse(pose)[:, :3], _undivided(told))
     of = slice(None) if problem.driven else found
     return _path(told, pose, covariance, of)
@@ -201,8 +211,8 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     hits, first, last = count_sightings(count, problem.place[used], seen_s, problem.measurements, told.stamp_s)
     covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
     points, turns = np.flatnonzero(~problem.oriented), np.flatnonzero(problem.oriented)
-    covariance[points] = told.spread.of(n + points, 3)
-    own, axes = told.spread.of(n + turns, 6), se3.rotation_of(place[turns])
+    covariance[points] = told.spread.of(n + points, 3) + told.considered(n + points, 3)
+    own, axes = told.spread.of(n + turns, 6) + told.considered(n + turns, 6), se3.rotation_of(place[turns])
     covariance[turns] = axes @ own[:, :3, :3] @ np.swapaxes(axes, 1, 2)  # a twist's translation is in the own axes
     turned[turns] = own[:, 3:, 3:]
     covariance = add_scale_error(covariance, place[:, :3], _undivided(told))
