@@ -42,7 +42,7 @@ KINDS: dict[str, Kind] = {
     "tracking": Kind("accuracy", "higher", 0.01, 0.002),
     "objective": Kind("accuracy", "lower", 1e-4),
     "nees": Kind("consistency", "one", 0.05),
-    "aligned_nees": Kind("consistency", "at_most_one", 0.05),  # an alignment lowers it: `PoseErrors`
+    "mapped_nees": Kind("consistency", "at_most_one", 0.05),  # a map that is the truth is better than it states
     "nis": Kind("consistency", "one", 0.05),
     "correlation": Kind("consistency", "lower", 0.05, 0.02),
     "level": Kind("consistency", "equal", 0.03, 0.0005),

@@ -105,7 +105,7 @@ def mrclam3_shifted(data: Path) -> Iterator[Named]:
         prior = shifted(as_map(recording.true_landmarks), [shift])
         result = em.run_slam(recording, prior_map=prior)
         true = [shift.undone(float(recording.frames.stamp_s[0]))]
-        yield from ((f"robot{robot}/{name}", value) for name, value in scores(recording, result))
+        yield from ((f"robot{robot}/{name}", value) for name, value in scores(recording, result, prior=prior))
         yield from ((f"robot{robot}/{name}", value) for name, value in changes(result.changes, true))
 
 
@@ -159,7 +159,7 @@ def tags(name: str, *, mapped: bool, data: Path) -> Iterator[Named]:
     prior = as_map(survey) if mapped else None
     with measured() as spent:
         result = em.run_slam(recording, prior_map=prior)
-    yield from scores(recording, result, rate_hz=RATE_HZ)
+    yield from scores(recording, result, prior=prior, rate_hz=RATE_HZ)
     if survey is not None:
         yield "survey/landmarks_m", space._to_survey(result.landmarks, survey)
     if mapped:
@@ -200,7 +200,7 @@ def starloc(session: str, *, data: Path) -> Iterator[Named]:
             print(f"  starloc {session}, {name}: {error}", flush=True)
             yield f"{name}/position_m", None
             continue
-        found = scores(recording, result, rate_hz=RATE_HZ)
+        found = scores(recording, result, prior=prior, rate_hz=RATE_HZ)
         wanted = ("position_m", "landmarks_m") if prior is None else None  # a lost run's turns and NEES say nothing
         yield from ((f"{name}/{of}", value) for of, value in found if wanted is None or of in wanted)
         yield f"{name}/cpu_s", spent.cpu_s
@@ -286,8 +286,9 @@ def case(name: str, *, data: Path) -> AnyRecording:
 def field_case(name: str, move: tuple[int, tuple[float, float, float]] | None = None, *, data: Path) -> Iterator[Named]:
     """Tags of a competition field, with its layout as exact map."""
     recording = case(name, data=data)
-    result = em.run_slam(recording, prior_map=as_map(recording.true_landmarks, 0.0))
-    yield from scores(recording, result)
+    layout = as_map(recording.true_landmarks, 0.0)
+    result = em.run_slam(recording, prior_map=layout)
+    yield from scores(recording, result, prior=layout)
     yield from changes(result.changes, [] if move is None else [moved(*move)])
 
 
@@ -304,8 +305,9 @@ def orchard(data: Path) -> Iterator[Named]:
 def anchors_left_behind(data: Path) -> Iterator[Named]:
     """A drive that leaves its anchors behind, in their map: nothing moved."""
     recording = case("f_uwb_moved_far", data=data)
-    result = em.run_slam(recording, prior_map=as_map(recording.true_landmarks))
-    yield from scores(recording, result)
+    anchors = as_map(recording.true_landmarks)
+    result = em.run_slam(recording, prior_map=anchors)
+    yield from scores(recording, result, prior=anchors)
     yield from changes(result.changes, [])
 
 
