@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -92,3 +94,17 @@ def test_odometry_or_a_map_tell_the_metre():
     assert recording.true_landmarks is not None
     known = recording.true_landmarks.as_prior(0.02)
     assert consider_range_errors(solve(recording, known).optimum).shape[1] == 0
+
+
+def test_without_odometry_a_data_sheet_says_how_well_the_metre_is_known():
+    recording = carried(3, 0.0)
+    stated = replace(recording, sensors=tuple(replace(one, sigma_scale=0.02) for one in recording.sensors))
+    known = recording.true_landmarks
+    assert known is not None
+    found, alone = run_slam(stated), run_slam(recording)
+    at = alone.landmarks.position_m
+    assert found.landmarks.position_m == pytest.approx(at)
+    more = found.landmarks.covariance_m2 - alone.landmarks.covariance_m2
+    assert more == pytest.approx(0.02**2 * at[:, :, None] * at[:, None, :], abs=1e-9)
+    in_map = [run_slam(one, prior_map=known.as_prior(0.02)).landmarks.covariance_m2 for one in (stated, recording)]
+    assert in_map[0] == pytest.approx(in_map[1])

@@ -313,12 +313,15 @@ def mount_parameters(name: str, value: FloatArray, sigma: FloatArray, prior: Flo
 
 
 def _undivided(told: _Told) -> float:
-    """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is, or
-    of directions alone the odometer.
+    """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is, of
+    directions alone the odometer, and without odometry the ranges, of which only a data sheet does.
     """
     problem, before = told.problem, told.intake.problem.scale_sigma
     if len(problem.prior.place) or problem.measurements:
         return 0.0
+    if not problem.driven:
+        stated = [one.sigma_scale for one in told.recording.sensors if one.sigma_scale is not None]
+        return min(stated, default=0.0)
     if problem.ray.all() and told.recording.sensors[0].sigma_odometer_scale is None:
         return problem.settings.scale_sigma
     return float(before * np.sqrt(problem.ranges_share * (1.0 - problem.ranges_share)))
