@@ -197,6 +197,19 @@ def test_clocks_are_asked_where_frames_begin_and_end_with_the_odometry(kind: str
     assert found.suspected is None
 
 
+def test_a_clock_whose_delay_was_estimated_is_not_held() -> None:
+    """What is left of its score is the difference of two ways to average a velocity: 8 sigmas of a right solution."""
+    world = World(seed=1, seconds=20.0, late_s=0.17)
+    recording = world.space()
+    found = scored(recording, None)
+    config = Config.model_validate({"slam": {"explain": {"on": False}}})
+    delays = [one for one in run_slam(recording, config).parameters if one.name.endswith("delay_s")]
+    assert [one.value for one in delays] == pytest.approx([world.late_s] * len(delays), abs=0.02)
+    assert len(delays) == len(recording.sensors)
+    assert "clock" not in {one.suspect.code for one in found.calibrations}
+    assert "clock-drift" in {one.suspect.code for one in found.calibrations}
+
+
 def test_lengths_in_space_are_asked() -> None:
     """Tags are larger than stated, and only the odometry says so."""
     world = World(seed=1, longer=1.05)
