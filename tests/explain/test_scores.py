@@ -210,6 +210,21 @@ def test_a_clock_whose_delay_was_estimated_is_not_held() -> None:
     assert "clock-drift" in {one.suspect.code for one in found.calibrations}
 
 
+@pytest.mark.parametrize(
+    ("subject", "free", "expected"),
+    [("left", [0.3, 0.0], True), ("right", [0.3, 0.0], False), ("detections", [0.3, 0.0], False),
+     ("detections", [0.3, 0.3], True)],
+)  # fmt: skip
+def test_each_clock_is_asked_whose_own_delay_was_held(subject: str, free: list[float], expected: bool) -> None:
+    problem = SimpleNamespace(delay_sigma_s=np.array(free))
+    smoother = SimpleNamespace(smoother=SimpleNamespace(problem=problem))
+    of: Any = SimpleNamespace(solved=SimpleNamespace(optimum=smoother))
+    sensors = [SimpleNamespace(name=name) for name in ("left", "right")]
+    inputs: Any = SimpleNamespace(recording=SimpleNamespace(sensors=sensors))
+    suspect: Any = SimpleNamespace(subject=subject)
+    assert scores._is_delay_estimated(of, inputs, suspect) is expected
+
+
 def test_lengths_in_space_are_asked() -> None:
     """Tags are larger than stated, and only the odometry says so."""
     world = World(seed=1, longer=1.05)
