@@ -5,9 +5,9 @@ step from the optimum with right stamps shows whether any sensor's are late, bef
 that may be are freed. As for the states in the plane (`slam.calibration`), 'as stated' and 'drawn from the prior' are
 weighed by their evidence, under the number of observations that the data are worth, and the estimate is the mean.
 
-An odometry with the stamps of the frames may have been made of them, as visual odometry is: its clock is theirs, and its
-velocity is that of a step, not of an instant, so that within half a step no delay is told. But a robot that logs all
-that it knows in one loop gives the same stamps to detections that are late, by a step or more.
+An odometry with the stamps of the frames may have been made of them, as visual odometry is: its clock is theirs, and
+its velocity is that of a step, not of an instant, so that within half a step no delay is told. But a robot that logs
+all that it knows in one loop gives the same stamps to detections that are late, by a step or more.
 
 A delay shows where the velocity changes. Odometry that jitters seems to change its velocity all the time, which shows
 no delay: the velocity is averaged over the time that shows most, and what jitter is left in it does not count.
