@@ -53,7 +53,7 @@ def test_mistakes_are_one_line(place: Path, tmp_path: Path) -> None:
     (tmp_path / "other.csv").write_text("id,x,y\n7001,0,0\n7002,1,0\n")
     (tmp_path / "there").write_text("mine")
     for arguments, line in (
-        ((tmp_path / "graph.g2o", place / "rec"), "is a pose graph (g2o or TORO), not a map of landmarks"),
+        ((tmp_path / "graph.g2o", place / "rec"), "is a pose graph (g2o, TORO or PyFG), not a map of landmarks"),
         ((tmp_path / "other.csv", place / "rec"), "no landmark of the map was ever seen: the map has 7001, 7002"),
         ((survey, place / "rec", "--write", tmp_path / "there"), "is there already"),
         ((survey, place / "rec", "--write", survey), "survey.csv"),

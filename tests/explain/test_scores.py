@@ -197,6 +197,34 @@ def test_clocks_are_asked_where_frames_begin_and_end_with_the_odometry(kind: str
     assert found.suspected is None
 
 
+def test_a_clock_whose_delay_was_estimated_is_not_held() -> None:
+    """What is left of its score is the difference of two ways to average a velocity: 8 sigmas of a right solution."""
+    world = World(seed=1, seconds=20.0, late_s=0.17)
+    recording = world.space()
+    found = scored(recording, None)
+    config = Config.model_validate({"slam": {"explain": {"on": False}}})
+    delays = [one for one in run_slam(recording, config).parameters if one.name.endswith("delay_s")]
+    assert [one.value for one in delays] == pytest.approx([world.late_s] * len(delays), abs=0.02)
+    assert len(delays) == len(recording.sensors)
+    assert "clock" not in {one.suspect.code for one in found.calibrations}
+    assert "clock-drift" in {one.suspect.code for one in found.calibrations}
+
+
+@pytest.mark.parametrize(
+    ("subject", "free", "expected"),
+    [("left", [0.3, 0.0], True), ("right", [0.3, 0.0], False), ("detections", [0.3, 0.0], False),
+     ("detections", [0.3, 0.3], True)],
+)  # fmt: skip
+def test_each_clock_is_asked_whose_own_delay_was_held(subject: str, free: list[float], expected: bool) -> None:
+    problem = SimpleNamespace(delay_sigma_s=np.array(free))
+    smoother = SimpleNamespace(smoother=SimpleNamespace(problem=problem))
+    of: Any = SimpleNamespace(solved=SimpleNamespace(optimum=smoother))
+    sensors = [SimpleNamespace(name=name) for name in ("left", "right")]
+    inputs: Any = SimpleNamespace(recording=SimpleNamespace(sensors=sensors))
+    suspect: Any = SimpleNamespace(subject=subject)
+    assert scores._is_delay_estimated(of, inputs, suspect) is expected
+
+
 def test_lengths_in_space_are_asked() -> None:
     """Tags are larger than stated, and only the odometry says so."""
     world = World(seed=1, longer=1.05)

@@ -6,6 +6,7 @@ import difflib
 import gzip
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -173,6 +174,24 @@ def test_only_what_is_corrected_changes(kind, tmp_path: Path) -> None:
         lines = len(changed_lines(path.read_bytes(), data))
         entry = {"wpilib": 7, "wpilib-2027": 7, "tagslam": 6, "geojson": 2}.get(kind.name, 1)
         assert 1 <= lines <= entry
+
+
+def test_a_map_in_braces_is_the_same_map_and_is_corrected_in_them(tmp_path: Path) -> None:
+    """TagSLAM's maps are YAML, which people also write as `position: {x: 1, y: 2, z: 3}`."""
+    plain = parsed(TAGSLAM, tmp_path / "plain.yaml")
+    indented = r"(position|rotation):\n +x: (\S+)\n +y: (\S+)\n +z: (\S+)(?=\n)"
+    text, count = re.subn(indented, r"\1: {x: \2, y: \3, z: \4}", TAGSLAM)
+    assert count >= 2
+    braced = parsed(text, tmp_path / "braced.yaml")
+    assert braced.format.name == "tagslam"
+    np.testing.assert_array_equal(braced.landmarks.position_m, plain.landmarks.position_m)
+    np.testing.assert_array_equal(braced.landmarks.rotation, plain.landmarks.rotation)
+    at = plain.landmarks.position_m[0] + [0.25, 0.0, 0.0]
+    one = Correction(int(plain.landmarks.landmark_id[0]), position_m=at)
+    after = correct_map(braced, [one])
+    assert len(changed_lines(text.encode(), after)) == 1
+    expected = re.sub(indented, r"\1: {x: \2, y: \3, z: \4}", correct_map(plain, [one]).decode())
+    assert after.decode() == expected
 
 
 @pytest.mark.parametrize("name", TEXTS)

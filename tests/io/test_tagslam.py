@@ -371,6 +371,8 @@ b:
 list:
 - x: 1
   y: [[1, 2], ['q', true]]
+  z: {x: 0, "y": -1.5, at: [1, {b: }, plain text],
+    word: http://x}
 - plain text
 -1.5: key
 e: {0}
@@ -400,7 +402,13 @@ def test_real_yaml_is_what_another_reader_says(shared_data: Path) -> None:
         ("a: 1\na: 2\n", r"x\.yaml:2: field 'a': appears twice"),
         ("a: [1, 2\nb: 3\n", r"x\.yaml:1: opens a bracket"),
         ("a: [1]]\n", r"x\.yaml:1: .*bracket"),
-        ("a: {b: 1}\n", r"x\.yaml:1: .*unsupported YAML"),
+        ("a: {b: 1\nc: 3\n", r"x\.yaml:1: opens a bracket"),
+        ("a: {b: 1}}\n", r"x\.yaml:1: text after the last bracket"),
+        ("a: {b: 1, b: 2}\n", r"x\.yaml:1: field 'b': appears twice"),
+        ("a: {b}\n", r"x\.yaml:1: .*no 'key: value'"),
+        ("a: {b: [1}]\n", r"x\.yaml:1: brackets do not match"),
+        ("a: [1 [2]]\n", r"x\.yaml:1: brackets do not match"),
+        ("a: {b: &name 1}\n", r"x\.yaml:1: .*unsupported YAML"),
         ("a: &name 1\n", r"x\.yaml:1: .*unsupported YAML"),
         ("a: |\n  text\n", r"x\.yaml:1: .*unsupported YAML"),
         ("a: 1\njust words\n", r"x\.yaml:2: .*neither"),
@@ -412,7 +420,7 @@ def test_yaml_that_is_not_read_is_refused(text: str, message: str) -> None:
         parse_yaml(text.encode(), Path("x.yaml"))
 
 
-@given(st.text(alphabet="ab:-[], \n'\"#1.", max_size=60))
+@given(st.text(alphabet="ab:-[]{}, \n'\"#1.", max_size=60))
 def test_no_yaml_surprises(text: str) -> None:
     """Whatever is written: a value, or one line that says what is wrong."""
     with suppress(InputError):

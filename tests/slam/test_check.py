@@ -18,7 +18,7 @@ from evermap.io import list_robots, read_mrclam, read_recording, write_template
 from evermap.slam import mistakes as mistakes_of
 from evermap.slam.calibration import SPECS, far_off
 from evermap.slam.mistakes import USUAL
-from evermap.types import Detections, Frames, Odometry, ParameterEstimate, Recording
+from evermap.types import UNKNOWN, Detections, Frames, Odometry, ParameterEstimate, Recording, rows_of
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 
@@ -67,7 +67,7 @@ def raw_check(recording: Recording) -> tuple[list[str], str]:
     """Codes and messages, without the refusal of degrees that the validation brings beforehand."""
     from evermap.slam.check import findings
 
-    found = findings(recording)
+    found = [each for each in findings(recording) if each.code != "left-out"]
     return [each.code for each in found if not each.code.startswith("beyond")], " | ".join(
         each.message for each in found
     )
@@ -187,6 +187,24 @@ def test_an_identity_for_every_detection_is_refused_before_it_costs() -> None:
 def test_mixed_identities_are_told() -> None:
     shuffled = readings(landmark_id=lambda ids: np.random.default_rng(0).permutation(ids))(patrol())
     assert raw_check(shuffled)[0] == ["landmarks-move"]
+
+
+def test_what_slam_refuses_or_leaves_out_is_told_before() -> None:
+    """`check` and `slam` say the same of a recording of which nothing, or less than all, can be used."""
+    recording = patrol()
+    seen = recording.detections
+    one = replace(recording, detections=rows_of(seen, seen.frame == seen.frame[0]))
+    with pytest.raises(DataError, match="seen in 1 frames") as refused:
+        run_slam(one)
+    [finding] = [one for one in check_recording(one).findings if not one.usable]
+    assert finding.code == "too-little"
+    assert refused.value.one_line().endswith(finding.message)
+    some = replace(seen, landmark_id=np.where(np.arange(len(seen)) % 3 == 0, UNKNOWN, seen.landmark_id))
+    partly = check_recording(replace(recording, detections=some))
+    assert partly.usable
+    assert [one.code for one in partly.findings] == ["left-out"]
+    nobody = replace(recording, detections=replace(seen, landmark_id=np.full(len(seen), UNKNOWN)))
+    assert [one.code for one in check_recording(nobody).findings] == ["no-identities"]
 
 
 def test_readings_beyond_the_limits_are_counted() -> None:

@@ -198,12 +198,13 @@ def test_what_ranges_do_not_locate_is_told_and_left_out() -> None:
     place = np.column_stack([np.linspace(20.0, 100.0, 8), np.full(8, 5.0)])[whole.detections.landmark_id]
     range_m = np.hypot(place[:, 0] - at, place[:, 1])
     recording = replace(whole, odometry=straight, detections=replace(whole.detections, range_m=range_m))
-    found, remarks = with_bearings(recording, Config().slam)
-    assert (found.detections.landmark_id == UNKNOWN).all()
-    assert remarks[1] == "landmarks that their ranges do not locate not used: 0, 1, 2, 3, 4, 5, 6, 7"
-    with pytest.raises(DataError, match="0 frames"):
+    none = "no landmark is located by its ranges alone"
+    with pytest.raises(DataError, match=none):
         run_slam(recording)
-    some = found.detections.bearing_rad.copy()
+    [finding] = [one for one in check_recording(recording).findings if not one.usable]  # `check` says what `slam` says
+    assert finding.code == "too-little"
+    assert finding.message.startswith(none)
+    some = np.zeros(len(recording.detections))
     some[recording.detections.landmark_id != 5] = np.nan  # what has a bearing is used without the ranges
     given = replace(recording, detections=replace(recording.detections, bearing_rad=some))
     found, remarks = with_bearings(given, Config().slam)

@@ -153,6 +153,8 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
     at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
     usual = list[tuple[Column, float, FloatArray]]()
     for suspect in sorted(_list_calibrations(inputs), key=lambda one: one.code not in USUAL):
+        if suspect.code == "clock" and _is_delay_estimated(session, inputs, suspect):
+            continue
         if suspect.code in OF_MOTION:
             direction = change_by_motion(session, screen, inputs, suspect)
         else:
@@ -182,6 +184,19 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         if gain > CHANCE:
             gain /= max(screen.variance(column, value) / column.information_with(column), 1.0)
         yield CalibrationScore(suspect, value, known**-0.5, gain, shift / sigma_m)
+
+
+def _is_delay_estimated(session: AnySession, inputs: Inputs, suspect: Suspect) -> bool:
+    """Return whether the clock of a suspect, of one sensor or of all, is a state in space that was not held.
+
+    What its score would be then is how far the velocity that was averaged for it is from that of the motions: nothing
+    but that is left where the state itself is marginalised.
+    """
+    if isinstance(session, Solved):
+        return False
+    free = session.solved.optimum.smoother.problem.delay_sigma_s > 0.0
+    own = np.array([one.name == suspect.subject for one in inputs.recording.sensors])
+    return bool(free[own].all() if own.any() else free.all())
 
 
 def _went_by_clock(session: AnySession, suspect: Suspect, dim: int) -> FloatArray:

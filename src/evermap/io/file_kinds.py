@@ -82,7 +82,7 @@ _MAP_HINTS: dict[str, str | None] = {
 _TEXTS: tuple[tuple[str, str, str, str], ...] = (
     (r"\s*<(?:!doctype|html)", "a web page", "download the file itself", "download the file itself"),
     (r"\s*<\?xml|\s*<sdf|\s*<robot", "XML", _TO_NATIVE, _FOR_MAP),
-    (r"(?:VERTEX|EDGE)_|(?:VERTEX|EDGE)[23]\s", "a pose graph (g2o or TORO)", "rename it to NAME.g2o", _MAKES_MAP),
+    (r"(?:VERTEX|EDGE)_|(?:VERTEX|EDGE)[23]\s", "a pose graph (g2o, TORO or PyFG)", "name it NAME.g2o", _MAKES_MAP),
     (r"P[25]\s", "an image (PGM)", _HINTS["detect"], _FOR_MAP),
     (r"%YAML:1\.0", "a calibration of OpenCV", _TO_NATIVE, _FOR_MAP),
 )

@@ -1,7 +1,7 @@
 """The part of YAML that calibration files are written in: nested maps and lists of numbers and words.
 
 Read here and not by a library, so that a folder of recordings is read by a plain installation. What is not understood
-(anchors, tags, texts of several lines, maps in braces) is refused, never guessed.
+(anchors, tags, texts of several lines) is refused, never guessed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ _WORDS: dict[str, Any] = {
     ".inf": float("inf"), "-.inf": -float("inf"), ".nan": float("nan"),
 }  # fmt: skip
 _KEY = re.compile(r"(\"[^\"]*\"|'[^']*'|[^\s\[\]{}#&*!|>%@`\"'-][^:#]*?|-[^\s:#][^:#]*?)\s*:(?:\s+(.*))?$")
-_UNREAD = tuple("{&*!|>%@`")
+_UNREAD = tuple("&*!|>%@`")
+_TOKEN = re.compile(
+    r"\s*(\"[^\"]*\"|'[^']*'|[\[\]{},]|:(?=[\s\[\]{},]|$)|(?<=[\"']):|[^\s\[\]{},\"':](?:[^\[\]{},:]|:(?![\s\[\]{},]|$))*)"
+)
+"""What lists in brackets and maps in braces are made of."""
+_CLOSING = {"[": "]", "{": "}"}
 
 
 class _Line(NamedTuple):
@@ -48,7 +53,7 @@ def parse_yaml(data: bytes, path: Path) -> Any:
 
 
 def _lines(text: str, path: Path) -> list[_Line]:
-    """Lines with content, without comments; a list in brackets is one line."""
+    """Lines with content, without comments; what is in brackets or braces is one line."""
     found: list[_Line] = []
     open_since: _Line | None = None
     for number, raw in enumerate(text.split("\n"), 1):
@@ -63,7 +68,7 @@ def _lines(text: str, path: Path) -> list[_Line]:
         else:
             indent = len(content) - len(content.lstrip())
             open_since = _Line(number, indent, content.strip())
-        if open_since.content.count("[") <= open_since.content.count("]"):
+        if all(open_since.content.count(one) <= open_since.content.count(end) for one, end in _CLOSING.items()):
             found.append(open_since)
             open_since = None
     if open_since is not None:
@@ -147,27 +152,54 @@ def _refuse_deeper(lines: list[_Line], at: int, indent: int, path: Path) -> None
 
 
 def _value(text: str, line: _Line, path: Path) -> Any:
-    """A scalar, or a list in brackets."""
+    """A scalar, a list in brackets, or a map in braces."""
     if text.startswith(_UNREAD):
         raise _error(line, f"{quote(text)} is unsupported YAML", path)
-    if not text.startswith("["):
+    if text[:1] not in _CLOSING:
         return _scalar(text)
-    if not text.endswith("]"):
-        raise _error(line, "text after a list in brackets", path)
-    stack: list[list[Any]] = [[]]
-    for part in re.findall(r"\"[^\"]*\"|'[^']*'|[\[\],]|[^\[\],\"']+", text):
-        if part == "[":
-            stack.append([])
-        elif part == "]":
-            if len(stack) < 2:
-                raise _error(line, "closes a bracket that was not opened", path)
-            inner = stack.pop()
-            stack[-1].append(inner)
-        elif part != "," and part.strip():
-            stack[-1].append(_scalar(part.strip()))
-    if len(stack) != 1 or len(stack[0]) != 1:
-        raise _error(line, "brackets do not match", path)
-    return stack[0][0]
+    tokens = [found[1].rstrip() for found in _TOKEN.finditer(text)]
+    if "".join(tokens).replace(" ", "") != re.sub(r"\s", "", text):
+        raise _error(line, f"{quote(text)} is unsupported YAML", path)
+    value, after = _collection(tokens, 0, line, path)
+    if after < len(tokens):
+        raise _error(line, f"text after the last bracket: {quote(tokens[after])}", path)
+    return value
+
+
+def _collection(tokens: list[str], start: int, line: _Line, path: Path) -> tuple[Any, int]:
+    """The list or map that is opened at a token, and the token after it."""
+    end, at = _CLOSING[tokens[start]], start + 1
+    items, pairs = list[Any](), dict[str, Any]()
+    while at < len(tokens) and tokens[at] != end:
+        if end == "}":
+            key = tokens[at].strip("\"'")
+            if at + 2 >= len(tokens) or tokens[at + 1] != ":" or tokens[at] in ("[", "{", "]", ",", ":"):
+                raise _error(line, f"{quote(tokens[at])} in braces is no 'key: value'", path)
+            if key in pairs:
+                raise InputError("appears twice", path=path, line=line.number, field=key)
+            empty = tokens[at + 2] in (",", "}")
+            pairs[key], at = (None, at + 2) if empty else _item(tokens, at + 2, line, path)
+        else:
+            value, at = _item(tokens, at, line, path)
+            items.append(value)
+        if at < len(tokens) and tokens[at] == ",":
+            at += 1
+        elif at < len(tokens) and tokens[at] != end:
+            raise _error(line, f"brackets do not match at {quote(tokens[at])}", path)
+    if at == len(tokens):
+        raise _error(line, "opens a bracket that is never closed", path)
+    return (pairs if end == "}" else items), at + 1
+
+
+def _item(tokens: list[str], at: int, line: _Line, path: Path) -> tuple[Any, int]:
+    """A scalar or a collection within one, and the token after it."""
+    if tokens[at] in _CLOSING:
+        return _collection(tokens, at, line, path)
+    if tokens[at] in ("]", "}", ",", ":"):
+        raise _error(line, f"brackets do not match at {quote(tokens[at])}", path)
+    if tokens[at].startswith(_UNREAD):
+        raise _error(line, f"{quote(tokens[at])} is unsupported YAML", path)
+    return _scalar(tokens[at]), at + 1
 
 
 def _scalar(text: str) -> Any:

@@ -141,9 +141,11 @@ def findings(recording: AnyRecording, settings: SlamConfig = DEFAULTS) -> tuple[
 
     The limits of its sensors are in force.
     """
-    found = find_misreadings(recording, settings)
     if is_in_space(recording):
-        found = [*_left_out(recording, settings), *found]
+        left_out = _left_out_in_space(recording, settings)
+    else:
+        left_out = _left_out_in_plane(recording, settings)
+    found = [*left_out, *find_misreadings(recording, settings)]
     return tuple(sorted(found, key=lambda finding: finding.usable))
 
 
@@ -360,7 +362,23 @@ def _find_corner_order(recording: SpatialRecording, settings: CheckConfig) -> li
     return [Finding("corner-order", CORNERS[how].message, usable=False)] if how else []
 
 
-def _left_out(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
+def _left_out_in_plane(recording: Recording, settings: SlamConfig) -> list[Finding]:
+    """Return detections that the estimator cannot use, and whether there are too few others."""
+    from evermap.slam.intake import prepare
+    from evermap.slam.ranges import with_bearings
+
+    known, some = recording.detections.landmark_id != UNKNOWN, recording
+    if settings.unknown_ids or not known.any():  # any identity will do: what else is wrong with them?
+        some = replace(recording, detections=replace(recording.detections, landmark_id=np.zeros_like(known, int)))
+    try:
+        some, told = with_bearings(some, settings) if some is recording else (some, ())
+        remarks = (*told[1:], *prepare(some, settings=settings.odometry).warnings)  # the first counts ranges alone
+    except DataError as error:
+        return [Finding("too-little", error.one_line().removeprefix(f"{recording.name}: "), usable=False)]
+    return [Finding("left-out", remark) for remark in remarks]
+
+
+def _left_out_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
     """Return detections that the estimator cannot use. Boxes without identity are associated by position."""
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic
@@ -503,13 +521,15 @@ def screened(
     if prior_map is not None and settings.unknown_ids is not True and (apart := strangers(prior_map, [recording])):
         remarks = (*remarks, apart)
     if not is_in_space(recording):
-        recording, told = with_bearings(recording, settings)
+        try:
+            recording, told = with_bearings(recording, settings)
+        except DataError:
+            wrong = next((finding for finding in found if not finding.usable), None)
+            if wrong is None:
+                raise
+            hint = "ranges in metres: as they are they locate nothing"
+            raise DataError(f"{recording.name}: {wrong.message}", hint=hint) from None
         remarks = (*remarks, *told)
-        wrong = next((finding for finding in found if not finding.usable), None)
-        if told and wrong is not None and (recording.detections.landmark_id == UNKNOWN).all():
-            raise DataError(
-                f"{recording.name}: {wrong.message}", hint="ranges in metres: as they are they locate nothing"
-            )
     if settings.unknown_ids is True or not settings.vote_ids or has_traffic(recording):  # the tracker assigns ids
         return recording, remarks, found
     voted = without_contradicted_ids(recording, settings)

@@ -54,7 +54,8 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
     Landmarks that the ranges do not locate lose their identity.
 
     Raises:
-        DataError: detections without bearing and without identity, which nothing can associate.
+        DataError: detections without bearing and without identity, which nothing can associate; or none with a bearing,
+            and no landmark that is located by its ranges.
     """
     seen, frames = recording.detections, recording.frames.stamp_s
     blind = np.isnan(seen.bearing_rad)
@@ -86,6 +87,9 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
         drift_m = settings.ranges.drift_share * abs(ranged.way_m[0] - fixes[nearest[0]].way_m)
         first_m = np.hypot(max(fixes[nearest[0]].sigma_m, settings.ranges.first_m), drift_m)
         sigma[rows[mine[0]]] = min(float(first_m / ranged.range_m[0]), ANY_BEARING_RAD)
+    if (landmark_id == UNKNOWN).all():
+        problem = f"{recording.name}: no landmark is located by its ranges alone"
+        raise DataError(problem, hint="more ranges of each, from places that are not on one line, while odometry runs")
     lost = np.setdiff1d(seen.landmark_id, landmark_id).tolist()  # others have bearings, too
     remarks = [f"{int(blind.sum())} detections without a bearing: only their ranges are used"]
     if lost:

@@ -402,6 +402,21 @@ def test_a_late_camera_is_found_by_default_and_a_right_one_is_left_alone():
     assert not any(each.name.endswith("delay_s") for each in of_frames.parameters)
 
 
+def test_a_loop_that_stamps_all_it_logs_alike_hides_no_late_camera():
+    """The odometry has the stamps of the frames, as visual odometry has, but the camera is late by two steps."""
+    whole = hall(20, n_points=40, n_frames=200, step_s=0.1, drift=0.01)
+    odometry, late_s = whole.odometry, 0.2
+    loop = odometry.stamp_s[(odometry.stamp_s >= late_s) & (odometry.stamp_s <= odometry.stamp_s[-1] - late_s)]
+    assert np.isin(np.round(whole.frames.stamp_s + late_s, 6), np.round(loop, 6)).mean() > 0.95
+    late = replace(whole, frames=Frames(whole.frames.stamp_s + late_s))
+    found = run_slam(late)
+    delay = next(each for each in found.parameters if each.name.endswith("delay_s"))
+    assert delay.value == pytest.approx(late_s, abs=4.0 * delay.sigma)
+    assert delay.sigma < 0.02
+    right = run_slam(whole)  # as visual odometry: it may have been made of the frames
+    assert not any(each.name.endswith("delay_s") for each in right.parameters)
+
+
 @pytest.mark.parametrize("late_s", [0.15, pytest.param(-0.3, marks=pytest.mark.slow)])
 def test_stamps_that_are_late_are_found(late_s):
     """From the changes of speed of a drive around a hall, with points; and the path is that of the right stamps."""

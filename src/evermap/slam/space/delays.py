@@ -5,6 +5,10 @@ step from the optimum with right stamps shows whether any sensor's are late, bef
 that may be are freed. As for the states in the plane (`slam.calibration`), 'as stated' and 'drawn from the prior' are
 weighed by their evidence, under the number of observations that the data are worth, and the estimate is the mean.
 
+An odometry with the stamps of the frames may have been made of them, as visual odometry is: its clock is theirs, and
+its velocity is that of a step, not of an instant, so that within half a step no delay is told. But a robot that logs
+all that it knows in one loop gives the same stamps to detections that are late, by a step or more.
+
 A delay shows where the velocity changes. Odometry that jitters seems to change its velocity all the time, which shows
 no delay: the velocity is averaged over the time that shows most, and what jitter is left in it does not count.
 """
@@ -30,6 +34,8 @@ LEAST_SHARE = 1e-3
 """Share of the changes of velocity that is no jitter, at least."""
 LONGEST_S = 2.0
 """Time before and after an instant over which the velocity there is averaged, at most."""
+OF_STEP = 0.5
+"""Least delay that an odometry with the stamps of the frames shows, in its steps."""
 MOST_ROUNDS, SETTLED = 4, 0.75
 """Times that delays are freed, until the whole steps in them are right to within so many."""
 USUAL = CalibrationConfig()
@@ -51,8 +57,9 @@ class Delays:
 def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]:
     """Return the optimum with the delays of the sensors' stamps; the same one where all are as stated."""
     problem, sigma_s = optimum.smoother.problem, optimum.smoother.problem.settings.delay_sigma_s
-    if problem.path is None or sigma_s == 0.0 or not problem.driven or problem.has_clock_of_frames:
+    if problem.path is None or sigma_s == 0.0 or not problem.driven:
         return optimum, None
+    least_s = OF_STEP * problem.path.step_s if problem.has_clock_of_frames else 0.0
     count, start, stated = len(problem.mount), optimum.estimate, optimum
     free = _freed(problem, optimum, np.full(count, sigma_s), np.zeros(count))
     smoother = SpatialSmoother(free, start.pose)
@@ -63,6 +70,8 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
     information, jitters = factorised.information.copy(), np.zeros(len(factorised.right))
     jitters[delay] = jitter
     off_s = np.asarray(np.linalg.solve(information - np.diag(jitters), factorised.right)[delay])
+    if least_s and np.abs(off_s).max() < least_s:
+        return optimum, None
     found, _ = _priced(smoother, now, off_s, sigma_s, jitter)
     # of a clock that is left as stated it is told how late it is if it is not
     found = replace(found, sigma_s=found.sigma_s / np.sqrt(np.maximum(found.p_needed, 1e-12)))
@@ -88,6 +97,8 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
             break
         variance = np.diag(smoother.factorised(now).border_covariance())[delay]
         jitter = _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s)
+    if least_s and np.abs(optimum.estimate.delay_s).max() < least_s:
+        return stated, None
     sober = replace(free, delay_sigma_s=np.where(asked, narrow**-0.5, 0.0))
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
 
