@@ -261,9 +261,10 @@ class _Truth:
 
     def beliefs(self, living: LivingMap, session: int, pose: FloatArray) -> list[tuple[float, bool, bool]]:
         """For every landmark that the map knows: P(exists), whether it stands at one of its known places, and whether
-        this session saw it.
+        this session saw it. Left out is what has no place where its body stands most probably.
         """
         places, members, found = living.places, living.members, []
+        known = living.place_row(members.landmark_id, living.site_of()) >= 0
         stands = self.position_m[session, places.landmark_id]
         gap = np.hypot(*(se2.transform(pose, places.position_m) - stands).T)
         right = np.unique(places.landmark_id[gap < OUTLIER_M])  # False for nan
@@ -273,7 +274,7 @@ class _Truth:
             for name, site in zip(places.landmark_id.tolist(), places.site_id.tolist(), strict=True)
             if last[site] >= self.start_s[session]
         }
-        for name, p in zip(members.landmark_id.tolist(), living.p_exists().tolist(), strict=True):
+        for name, p in zip(members.landmark_id[known].tolist(), living.p_exists()[known].tolist(), strict=True):
             found.append((p, bool(np.isin(name, right)), name in seen))
         return found
 
