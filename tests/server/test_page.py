@@ -464,6 +464,9 @@ def test_landmarks_are_named_under_the_pointer_and_as_their_names_are_typed(site
     chairs = browser.value("placed.filter((one) => one.class === 'chair').map((one) => one.label)")
     assert sorted(browser.value(names)) == sorted(chairs)
     assert chairs
+    browser.value(f"document.getElementById('name').value = {json.dumps(first['label'])}, search()")
+    browser.painted()
+    assert first["label"] in browser.value(names)  # by its own name
     browser.value("document.getElementById('name').value = '', draw(placed.slice(0, 5), [])")
     browser.painted()
     assert len(browser.value(names)) == 5  # few enough to name all
