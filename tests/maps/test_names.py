@@ -189,6 +189,10 @@ def test_names_are_kept_in_the_file_and_reverted_with_it(tmp_path: Path) -> None
         assert diff(store, 1, 2).edits == ((chair, f"renamed from {short}"),)
         assert diff(store, 2, 1).edits == ((chair, "renamed from throne"),)
         assert why(store, "throne").headline.startswith("landmark throne is ")
+        assert [(number, word) for number, _, word in why(store, "throne").edits] == [(2, f"renamed from {short}")]
+        assert f"an operator renamed it from {short} in revision 2 (" in why(store, "throne").reasons[0]
+        other = next(one for one in ids.values() if one != chair)
+        assert why(store, living.label(other)).edits == ()
         with pytest.raises(InputError, match="no landmark nobody in revision 2"):
             rename_landmark(store, "nobody", "x")
         with pytest.raises(InputError, match="there is throne"):

@@ -56,6 +56,35 @@ def test_robots_with_names_of_their_own_may_drive_at_once(tmp_path: Path) -> Non
             em.enter_session(store, shift_stamps(replace(SESSIONS[1], robot="a"), 5.0))
 
 
+def test_one_robot_is_not_at_two_places_at_once_on_any_clock(tmp_path: Path) -> None:
+    first, second = (
+        replace(one, robot="a") for one in simulate_building(BuildingConfig(days=2, patrol_s=35.0), 3).sessions
+    )
+    assert first.clock is Clock.UNIX
+    begun_s = [float(one.frames.stamp_s[0]) for one in (first, second)]
+    at_once = shift_stamps(second, begun_s[0] - begun_s[1] + 10.0)
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        em.enter_session(store, first).commit(store)
+        with pytest.raises(DataError, match="overlaps that of the session"):
+            em.enter_session(store, at_once)
+        with pytest.raises(DataError, match="overlaps"):  # a gap is laid between clocks that start anew alone
+            em.enter_session(store, at_once, LAID)
+        em.enter_session(store, replace(at_once, robot="b"))
+        em.enter_session(store, second)
+
+
+@pytest.mark.parametrize("begins_s", [0.0, 5.0e7])
+def test_a_clock_that_was_not_set_is_asked_about(tmp_path: Path, begins_s: float) -> None:
+    first, second = simulate_building(BuildingConfig(days=2, patrol_s=35.0), 3).sessions
+    unset = shift_stamps(second, begins_s - float(second.frames.stamp_s[0]))
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        with pytest.raises(DataError, match="its clock was not set"):
+            em.enter_session(store, unset)
+        em.enter_session(store, first).commit(store)
+        with pytest.raises(DataError, match="its clock was not set"):
+            em.enter_session(store, unset)
+
+
 def test_a_shift_moves_every_stamp_and_nothing_else() -> None:
     later = shift_stamps(SESSIONS[0], 7.0)
     assert later.odometry is not None

@@ -42,8 +42,24 @@ from evermap_studies.sim import BuildingConfig, simulate_building
 
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 AXE = Path(__file__).resolve().parents[2] / "out/browser/axe_playwright_python/axe.min.js"
+CLASSES = ("cart", "chair", "door", "fixture", "pallet", "shelf")
 HOSTILE = "<img src=x onerror=\"document.title='broken'\">"
 WAIT_S = 60.0
+ON_SCREEN = (
+    "(one) => { const p = new DOMPoint(one.x_m, -one.y_m).matrixTransform(document.getElementById('map')"
+    ".getScreenCTM()); return [p.x, p.y]; }"
+)
+"""Where a landmark is in the window."""
+PIXEL = (
+    "(() => { const [x, y] = placed.map(ON_SCREEN)[0], canvas = document.getElementById('marks');"
+    " const { left, top } = canvas.getBoundingClientRect();"
+    " return [...canvas.getContext('2d').getImageData(Math.round(x - left), Math.round(y - top), 1, 1).data]; })()"
+).replace("ON_SCREEN", ON_SCREEN)
+"""What the first landmark is drawn with in its middle: red, green, blue and opacity."""
+MANY = (
+    "Array.from({ length: 2000 }, (_, k) => ({ landmark: k, label: `chair K${k}`, class: 'abcdefgh'[k % 8],"
+    " x_m: k % 50, y_m: Math.floor(k / 50), p_exists: (k % 101) / 100, deleted: false }))"
+)
 LOOKS = {
     "light": (1280, 900, "light", False),
     "dark": (1280, 900, "dark", False),
@@ -341,7 +357,9 @@ def test_who_only_reads_has_no_buttons_that_change(site: Site, browser: Browser)
 def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Browser) -> None:
     browser.show(*LOOKS["phone"])
     browser.log_in(site.address, site.tokens["read"])
-    assert browser.value("document.documentElement.scrollWidth <= innerWidth"), "the phone scrolls sideways"
+    assert browser.value("[document.documentElement.scrollWidth, innerWidth]") == [375, 375], (
+        "the phone scrolls sideways"
+    )
     width = "Number(document.getElementById('map').getAttribute('viewBox').split(' ')[2])"
     whole = browser.value(width)
     browser.value("document.getElementById('map').scrollIntoView({ block: 'center' })")
@@ -362,9 +380,8 @@ def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Br
     browser.wait(f"{width} < {whole} / 2.5")
     browser.painted()
     mark = browser.value(
-        "(() => { const far = (one) => Math.hypot(one.x - innerWidth / 2, one.y - innerHeight / 2);"
-        " return [...document.querySelectorAll('.mark')].map((one) => one.getBoundingClientRect())"
-        ".sort((a, b) => far(a) - far(b)).map((one) => [one.x + one.width / 2, one.y + one.height / 2])[0]; })()"
+        f"(() => {{ const far = ([x, y]) => Math.hypot(x - innerWidth / 2, y - innerHeight / 2);"
+        f" return placed.map({ON_SCREEN}).sort((a, b) => far(a) - far(b))[0]; }})()"
     )
     touch("touchStart", (mark[0] + 8, mark[1]))  # a finger is not exact
     touch("touchEnd")
@@ -378,6 +395,145 @@ def test_the_map_is_moved_and_asked_by_finger_and_by_key(site: Site, browser: Br
     before = browser.value(left)
     browser.press("ArrowRight")
     browser.wait(f"{left} > {before}")
+
+
+def test_classes_have_shapes_and_colours_that_a_legend_explains(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    known = site("GET", "/maps/ward/landmarks").json()["landmarks"]
+    counts = {name: sum(one["class"] == name and one["p_exists"] >= 0.5 for one in known) for name in CLASSES}
+    told = browser.value("[...document.querySelectorAll('#classes span')].map((one) => one.textContent.trim())")
+    assert told == [f"{name}, {count}" for name, count in counts.items()]
+    looks = browser.value(
+        "[...document.querySelectorAll('#classes path')].map((one) =>"
+        " [one.getAttribute('d'), getComputedStyle(one).fill])"
+    )
+    assert len({d for d, _ in looks}) == len(counts)
+    # a landmark has on the map the colour that its class has in the legend
+    browser.value("draw([placed.find((one) => one.class === 'cart' && one.p_exists > 0.99)], [])")
+    browser.painted()
+    assert f"rgb({', '.join(map(str, browser.value(PIXEL)[:3]))})" == looks[0][1]
+    browser.show(*LOOKS["dark"])
+    browser.painted()
+    dark = browser.value("getComputedStyle(document.querySelector('#classes path')).fill")
+    assert dark != looks[0][1]
+    assert f"rgb({', '.join(map(str, browser.value(PIXEL)[:3]))})" == dark
+    browser.value("kinds = Array.from({ length: 35 }, (_, k) => `class ${k}`)")
+    assert browser.value("new Set(kinds.map((one) => String(looks(one)))).size") == 35
+    assert browser.value("SHAPES.length * COLOURS") == 35
+
+
+def test_what_probably_does_not_exist_is_faint_whatever_is_told_of_it(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+
+    def drawn(p: float, kind: str) -> tuple[float, bool, float | None, int]:
+        """How opaque a landmark is and whether it is filled, the opacity of the frame around it, that of its middle."""
+        one = {"landmark": 1, "label": "1", "class": "cart", "x_m": 1.0, "y_m": 2.0, "p_exists": p, "deleted": False}
+        told = {"kind": kind, "landmarks": [1], "displacement_m": [None, None], "rotation_rad": 0.0, "probability": 0.9}
+        browser.value(f"draw([{json.dumps(one)}], [{json.dumps(told)}])")
+        browser.painted()
+        opacity, there = browser.value("[marks[0].opacity, marks[0].there]")
+        frame = browser.value("document.querySelector('#map .new')?.getAttribute('opacity') ?? null")
+        return opacity, there, None if frame is None else float(frame), browser.value(PIXEL)[3]
+
+    assert drawn(0.29, "returned") == (0.29, False, 0.29, 0)
+    assert drawn(0.6, "returned") == (0.6, True, 0.6, 153)
+    assert drawn(1.0, "appeared") == (1.0, True, 1.0, 255)
+    assert drawn(0.9, "vanished")[1:] == (False, None, 0)
+    assert drawn(0.001, "moved")[0] == 0.2  # still to be found
+
+
+def test_landmarks_are_named_under_the_pointer_and_as_their_names_are_typed(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    names = "[...document.querySelectorAll('#map .name')].map((one) => one.textContent)"
+    assert browser.value(names) == []
+    x, y = browser.value(f"placed.slice(0, 1).map({ON_SCREEN})[0]")
+    browser("Input.dispatchMouseEvent", type="mouseMoved", x=x + 3, y=y)
+    browser.painted()
+    first = site("GET", "/maps/ward/landmarks").json()["landmarks"][0]
+    (label,) = browser.value(names)
+    assert label.startswith(f"{first['label']} {first['class']}, ")
+    browser("Input.dispatchMouseEvent", type="mouseMoved", x=5, y=5)
+    browser.painted()
+    assert browser.value(names) == []
+    browser.tab_to("#name")
+    browser("Input.insertText", text="CHAI")
+    browser.painted()
+    chairs = browser.value("placed.filter((one) => one.class === 'chair').map((one) => one.label)")
+    assert sorted(browser.value(names)) == sorted(chairs)
+    assert chairs
+    browser.value(f"document.getElementById('name').value = {json.dumps(first['label'])}, search()")
+    browser.painted()
+    assert first["label"] in browser.value(names)  # by its own name
+    browser.value("document.getElementById('name').value = '', draw(placed.slice(0, 5), [])")
+    browser.painted()
+    assert len(browser.value(names)) == 5  # few enough to name all
+
+
+def test_thousands_of_landmarks_are_drawn_without_an_element_each(site: Site, browser: Browser) -> None:
+    """Frames a second are measured by `benchmarks.page`."""
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    browser.value(f"draw({MANY}, [])")
+    browser.painted()
+    assert browser.value("marks.length") == 2000
+    assert browser.value("document.querySelectorAll('#map *').length") < 20
+    browser.value("look(0.2)")
+    browser.painted()
+    assert 20 < browser.value("marks.length") < 200
+
+
+def test_uploads_are_a_table_with_their_verdicts(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["phone"])
+    browser.log_in(site.address, site.tokens["read"])
+    rows = browser.value(
+        "[...document.querySelectorAll('#jobs tbody tr')].map((one) => [...one.cells].map((cell) => cell.textContent))"
+    )
+    jobs = site("GET", "/jobs?site=ward").json()
+    assert [(row[0], row[1], row[3], row[4]) for row in rows] == [
+        (str(job["id"]), job["robot"], f"✓ entered, revision {job['revision']}", "sound") for job in jobs
+    ]
+    assert [row[5] for row in rows] == [job["remarks"] for job in jobs]
+    refused = {**jobs[0], "state": "aside", "verdict": "lost", "remarks": HOSTILE, "revision": 3}
+    browser.value(f"tableOfJobs([{json.dumps(refused)}])")
+    assert browser.text("#jobs tbody td:nth-child(4)") == "△ set aside"
+    assert browser.text("#jobs tbody td:nth-child(6)") == HOSTILE
+    # on a phone each row is a card: nothing is cut, and what a number means is said beside it
+    for name in ("robots", "jobs"):
+        inside = browser.value(
+            f"[...document.querySelectorAll('#{name} td')].every((one) => one.scrollWidth <= one.clientWidth"
+            " && one.getBoundingClientRect().right <= innerWidth)"
+        )
+        assert inside, name
+        heads = f"[...document.querySelectorAll('#{name} tbody tr:first-child td')].map((one) => one.dataset.head)"
+        assert browser.value(heads) == browser.value(
+            f"[...document.querySelectorAll('#{name} th')].map((one) => one.textContent)"
+        )
+        shown = f"getComputedStyle(document.querySelector('#{name} td'), '::before').content"
+        assert browser.value(shown) == '"' + browser.value(heads)[0] + '"'
+    browser.value("tableOfJobs([])")
+    assert browser.text("#uploads") == "None yet."
+
+
+def test_a_landmark_is_renamed_on_the_page(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["approve"])
+    label = browser.value("placed[0].label")
+    browser.value(f"goTo({json.dumps(label)})")
+    browser.wait("document.querySelector('#why svg')")
+    browser.tab_to("#word-name")
+    browser.value("document.getElementById('word-name').select()")
+    browser("Input.insertText", text="chair at the door")
+    browser.tab_to("#renames")
+    browser.press("Enter")
+    browser.wait("document.getElementById('pins').textContent === 'Pin chair at the door'")
+    assert "chair at the door" in browser.value(
+        "[...document.querySelectorAll('#map .name')].map((one) => one.textContent)"
+    )
+    assert "renamed landmark" in browser.text("#said")
+    assert site("GET", "/maps/ward/landmarks/chair at the door/why").json()["label"] == "chair at the door"
 
 
 def test_robots_are_on_the_map_where_they_were_last_and_where_they_are_next(site: Site, browser: Browser) -> None:

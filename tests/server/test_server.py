@@ -88,7 +88,7 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     answer = fleet.upload(zips[0])
     assert answer.status_code == 202
     job = answer.json()
-    assert (job["state"], job["robot"], job["site"]) == ("queued", "upload", "ward")
+    assert (job["state"], job["robot"], job["site"], job["verdict"]) == ("queued", "upload", "ward", "")
     again = fleet.upload(zips[0])
     assert (again.status_code, again.json()["id"]) == (200, job["id"])
     fleet.upload(zips[2])
@@ -96,7 +96,8 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     while worker.step():
         pass
     entered = fleet("GET", f"/jobs/{job['id']}").json()
-    assert (entered["state"], entered["reason"].split(",")[0]) == ("entered", "sound")
+    assert (entered["state"], entered["reason"].split(",")[0], entered["verdict"]) == ("entered", "sound", "sound")
+    assert entered["remarks"] == entered["reason"].removeprefix("sound").removeprefix(", ")
     assert fleet("GET", f"/jobs/{job['id']}").json()["revision"] == 1
     assert fleet("GET", f"/jobs/{job['id']}/payload").status_code == 404
     assert fleet.upload(zips[0]).json()["state"] == "entered"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from evermap_studies.partial_views.study import HARD, Row, Settings, live
+from evermap_studies.partial_views.table import as_markdown
 
 pytestmark = pytest.mark.slow
 
@@ -45,6 +46,20 @@ def test_nothing_is_told_of_what_never_changed_or_was_not_looked_at(changing: Ro
     assert [row for row in changing["told"] if row["looks"] == 0] == []
     right = [row["true"] for row in changing["told"]]
     assert sum(right) >= 0.9 * len(right)
+
+
+def test_beliefs_and_displacements_are_scored_against_the_truth(changing: Row) -> None:
+    pairs = changing["beliefs"]
+    seen = [(p, stands) for p, stands, was_seen in pairs if was_seen]
+    assert sum(stands for _, stands in seen) >= 0.95 * len(seen)
+    assert min(p for p, _ in seen) > 0.5
+    assert 0 < len(seen) < len(pairs)
+    moved = [row for row in changing["told"] if "squared" in row and row["true"]]
+    assert moved
+    assert all(row["error_m"] < 0.5 * row["moved_m"] for row in moved)
+    text = as_markdown({"worlds": [changing], "still": []})
+    assert sum(line.startswith("| not seen |") for line in text.splitlines()) > 2
+    assert "| moved |" in text
 
 
 def test_most_of_what_was_looked_at_before_and_after_is_told(changing: Row) -> None:

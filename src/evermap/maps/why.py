@@ -10,7 +10,7 @@ import numpy as np
 
 from evermap.errors import InputError, similar
 from evermap.existence.sites import Evidence
-from evermap.maps.diff import edits, story_of
+from evermap.maps.diff import edits, renames, story_of
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import LOOKS, read_looks
@@ -178,13 +178,20 @@ def _visit(revision: Revision, seen: Evidence) -> Visit:
 
 def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tuple[int, str, str], ...]:
     """Return the operators' edits of a landmark: revision, time, edit."""
-    return tuple(
-        (item.number, item.created_at, word)
-        for item in line
-        if item.provenance.kind is RevisionKind.EDIT
-        for name, word in edits(store.members(item.parent), store.members(item.number))
-        if name == landmark_id
-    )
+    found = []
+    for item in line:
+        if item.provenance.kind is RevisionKind.EDIT:
+            words = edits(store.members(item.parent), store.members(item.number))
+            if not words:  # only then it may be a name, for which both maps are read
+                words = renames(store.load(item.parent), store.load(item.number))
+            found += [(item.number, item.created_at, word) for name, word in words if name == landmark_id]
+    return tuple(found)
+
+
+def _put(word: str) -> str:
+    """An edit with its landmark: 'pinned it', 'renamed it from chair 5'."""
+    verb, *rest = word.split(" ", 1)
+    return " ".join([verb, "it", *rest])
 
 
 def _with_words(answer: Answer, living: LivingMap) -> Answer:
@@ -199,7 +206,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
         headline = f"{what} is believed to be there: {belief}"
     else:
         headline = f"{what} is believed gone: {belief}"
-    reasons = [f"an operator {word} it in revision {number} ({when})" for number, when, word in answer.edits]
+    reasons = [f"an operator {_put(word)} in revision {number} ({when})" for number, when, word in answer.edits]
     reasons += _on_sightings(answer, living)
     if answer.companions:
         others = ", ".join(map(living.label, answer.companions))

@@ -13,8 +13,8 @@ import numpy as np
 
 from evermap.errors import DataError
 from evermap.maps.store import Revision, RevisionKind
-from evermap.types import AnyRecording, Measurements
-from evermap.valid import OVERLAP_S, has_own_clock
+from evermap.types import AnyRecording, Clock, Measurements
+from evermap.valid import OVERLAP_S, SINCE_1970_S, has_own_clock
 
 
 def place_session(recording: AnyRecording, log: Sequence[Revision], clock_gap_s: float | None) -> AnyRecording:
@@ -24,17 +24,25 @@ def place_session(recording: AnyRecording, log: Sequence[Revision], clock_gap_s:
     keeps its stamps.
 
     Raises:
-        DataError: it keeps its stamps, and another session of the same robot was at the same time.
+        DataError: it keeps its stamps, and its clock was not set, or another session of the same robot was at the same
+            time.
     """
     stamp_s = recording.frames.stamp_s
-    if not has_own_clock(recording):
+    if not len(stamp_s):
         return recording
     first_s, last_s = float(np.nanmin(stamp_s)), float(np.nanmax(stamp_s))
+    if recording.clock is Clock.UNIX and first_s < SINCE_1970_S:
+        raise DataError(
+            f"{recording.name}: its clock was not set: its stamps begin {first_s:.1f} s after 1970",
+            field="stamp_s",
+            hint='the right stamps; or clock = "recording" in sensor.toml and --set living.clock_gap_s=SECONDS from '
+            "the newest session to it",
+        )
     origins = [one.provenance for one in log if one.provenance.kind is RevisionKind.SESSION]
     spans = [(one.stamp_from_s, one.stamp_to_s, one) for one in origins if np.isfinite(one.stamp_to_s)]
     if not spans:
         return recording
-    if clock_gap_s is not None:
+    if clock_gap_s is not None and has_own_clock(recording):
         return shift_stamps(recording, max(last for _, last, _ in spans) + clock_gap_s - first_s)
     for start_s, stop_s, other in spans:
         common_s = min(stop_s, last_s) - max(start_s, first_s)

@@ -9,6 +9,8 @@ let order = [], clock = "unix"; // revisions by the time of the world that they 
 let operator = false, approved = 0, chosen = null, picks = 0; // how often a revision was chosen
 let placed = [], told = [], fleet = [], held = []; // landmarks, changes, robots on the map, and what robots report
 let whole = null, view = null, tile = null; // which part is drawn
+let kinds = [], marks = [], hovered = null, searched = new Set(), painting = false; // classes as in the legend
+const MOST_NAMES = 30, RADIUS = 5; // names on the map at once, and half of a landmark's size in pixels
 
 async function get(path, how = {}) {
   const headers = { Authorization: `Bearer ${token}`, "Content-Type": "application/json" };
@@ -49,10 +51,16 @@ function list(id, lines) {
 }
 
 function table(id, heads, rows) {
-  const cell = (text) => (typeof text === "string" ? element("td", text) : element("td", "", text));
-  const lines = rows.map((row) => element("tr", "", ...row.map(cell)));
-  const head = heads.map((text) => Object.assign(element("th", text), { scope: "col" }));
-  $(id).replaceChildren(...(rows.length ? [element("thead", "", element("tr", "", ...head)), element("tbody", "", ...lines)] : []));
+  const roled = (node, role) => { node.setAttribute("role", role); return node; }; // as cards, on a phone, it is a table, too
+  const cell = (text, k) => {
+    const node = roled(typeof text === "string" ? element("td", text) : element("td", "", text), "cell");
+    node.dataset.head = heads[k]; // said beside it on a phone
+    return node;
+  };
+  const lines = rows.map((row) => roled(element("tr", "", ...row.map(cell)), "row"));
+  const head = heads.map((text) => roled(Object.assign(element("th", text), { scope: "col" }), "columnheader"));
+  roled($(id), "table");
+  $(id).replaceChildren(...(rows.length ? [element("thead", "", roled(element("tr", "", ...head), "row")), element("tbody", "", ...lines)] : []));
 }
 
 const minute = (stamp) => stamp.slice(0, 16).replace("T", " ");
@@ -139,7 +147,9 @@ function draw(landmarks, changes) {
   const edge = Math.max(right - left, high - low, 1) / 20;
   whole = { x: left - edge, y: low - edge, w: right - left + 2 * edge, h: high - low + 3 * edge }; // a scale fits below
   if (!$("map").classList.contains("near")) view = { ...whole };
-  paint();
+  hovered = null;
+  legend();
+  search();
 }
 
 const metre = () => Math.max(view.w / ($("map").clientWidth || 800), view.h / ($("map").clientHeight || 500)); // a pixel's
@@ -149,42 +159,106 @@ function kindOf(change, k) { // of a replacement the first ones are gone
   return k < change.landmarks.length / 2 ? "vanished" : "appeared";
 }
 
+// Shapes of classes, with 1 as half of their size. Of 35 classes no two have the same shape and colour.
+const polygon = (points) => `M${points.join("L")}Z`;
+const regular = (count, first) => polygon(Array.from({ length: count }, (_, k) => first + (2 * Math.PI * k) / count).map((a) => [1.15 * Math.cos(a), 1.15 * Math.sin(a)]));
+const CIRCLE = "M-1 0a1 1 0 1 0 2 0a1 1 0 1 0 -2 0Z", CROSS = [[-1, -0.35], [-0.35, -0.35], [-0.35, -1], [0.35, -1], [0.35, -0.35], [1, -0.35]];
+const SHAPES = [CIRCLE, polygon([[-0.9, -0.9], [0.9, -0.9], [0.9, 0.9], [-0.9, 0.9]]), regular(3, -Math.PI / 2), regular(4, 0),
+  polygon([...CROSS, ...CROSS.map(([x, y]) => [-x, -y])]), regular(3, Math.PI / 2), regular(6, 0)];
+const COLOURS = 5; // of classes, in page.css
+const looks = (name) => { const k = kinds.indexOf(name); return [k % SHAPES.length, k % COLOURS]; };
+
+// Landmarks, on a canvas below the rest: of those thousands are drawn in a frame. A landmark is faint where it probably
+// does not exist, and hollow where it is believed gone.
+function paintMarks() {
+  const canvas = $("marks"), map = $("map"), ink = getComputedStyle(canvas), dots = window.devicePixelRatio || 1, m = metre();
+  const [wide, tall] = [map.clientWidth, map.clientHeight];
+  if (canvas.width !== Math.round(wide * dots) || canvas.height !== Math.round(tall * dots)) [canvas.width, canvas.height] = [Math.round(wide * dots), Math.round(tall * dots)];
+  const pen = canvas.getContext("2d"), size = RADIUS * dots, shapes = SHAPES.map((d) => new Path2D(d));
+  const colours = Array.from({ length: COLOURS }, (_, k) => ink.getPropertyValue(`--c${k}`));
+  pen.setTransform(1, 0, 0, 1, 0, 0);
+  pen.clearRect(0, 0, canvas.width, canvas.height);
+  pen.lineWidth = 0.3;
+  for (const { at: [x, y], look: [form, colour], there, opacity } of marks) {
+    const [u, v] = [(x - view.x - view.w / 2) / m + wide / 2, (y - view.y - view.h / 2) / m + tall / 2];
+    pen.setTransform(size, 0, 0, size, u * dots, v * dots);
+    pen.globalAlpha = opacity;
+    pen.fillStyle = pen.strokeStyle = colours[colour];
+    if (there) pen.fill(shapes[form]);
+    else pen.stroke(shapes[form]);
+  }
+}
+
 function paint() {
-  const size = 5 * metre(), of = new Map(placed.map((one) => [one.landmark, one])), nodes = [];
-  const kinds = new Map(told.flatMap((change) => change.landmarks.map((id, k) => [id, kindOf(change, k)])));
+  painting = false;
+  const size = RADIUS * metre(), of = new Map(placed.map((one) => [one.landmark, one])), nodes = [], named = [];
+  const changed = new Map(told.flatMap((change) => change.landmarks.map((id, k) => [id, kindOf(change, k)])));
+  const seen = placed.filter(({ x_m: x, y_m: y }) => x > view.x - size && x < view.x + view.w + size && -y > view.y - size && -y < view.y + view.h + size);
+  const few = seen.length <= MOST_NAMES;
   if (tile) nodes.push(shape("rect", { ...tile, "stroke-width": size / 3 }, "tile"));
-  for (const one of placed) {
-    const kind = kinds.get(one.landmark), x = one.x_m, y = -one.y_m;
-    if (x < view.x - view.w || x > view.x + 2 * view.w || y < view.y - view.h || y > view.y + 2 * view.h) continue;
-    const fresh = kind === "appeared" || kind === "returned", there = one.p_exists >= 0.5;
-    const mark = one.landmark === chosen?.landmark ? "mark chosen" : "mark";
-    let node;
+  marks = seen.map((one) => {
+    const kind = changed.get(one.landmark), [x, y] = [one.x_m, -one.y_m], mine = one.landmark === chosen?.landmark;
+    const opacity = Math.max(one.p_exists, 0.2); // still to be found
     if (kind === "vanished") {
       const d = `M${x - size} ${y - size}l${2 * size} ${2 * size}m0 ${-2 * size}l${-2 * size} ${2 * size}`;
-      node = shape("path", { d, "stroke-width": size / 2 }, `vanished ${mark}`);
-    } else if (fresh) {
-      node = shape("rect", { x: x - size, y: y - size, width: 2 * size, height: 2 * size, "stroke-width": 0 }, `new ${mark}`);
-    } else {
-      node = shape("circle", { cx: x, cy: y, r: size, "stroke-width": size / 4 }, `${there ? "there" : "gone"} ${mark}`);
-      node.setAttribute("opacity", String(Math.max(0.15, there ? one.p_exists : 0.35)));
+      nodes.push(shape("path", { d, "stroke-width": size / 2 }, "vanished"));
+    } else if (kind === "appeared" || kind === "returned") {
+      const at = { x: x - 1.8 * size, y: y - 1.8 * size, width: 3.6 * size, height: 3.6 * size };
+      nodes.push(shape("rect", { ...at, "stroke-width": size / 2, opacity }, "new"));
     }
-    if (mark !== "mark") nodes.push(shape("circle", { cx: x, cy: y, r: 2 * size, "stroke-width": size / 2 }, "ring"));
-    const title = document.createElementNS(SVG, "title");
-    title.textContent = `${one.label} ${one.label.startsWith(one.class || "") ? "" : one.class} ${percent(one.p_exists)}`;
-    node.append(title);
-    nodes.push(node);
-  }
+    if (mine) nodes.push(shape("circle", { cx: x, cy: y, r: 2.4 * size, "stroke-width": size / 2 }, "ring"));
+    if (one === hovered || mine || few || searched.has(one)) named.push(one);
+    return { at: [x, y], look: looks(one.class || ""), there: one.p_exists >= 0.5 && kind !== "vanished", opacity };
+  });
   for (const change of told.filter((one) => one.kind === "moved" && one.displacement_m.every((x) => x !== null))) {
     for (const one of change.landmarks.map((id) => of.get(id)).filter(Boolean)) {
       const [dx, dy] = change.displacement_m, [x, y] = [one.x_m, -one.y_m], turn = Math.atan2(-dy, dx);
       const tip = (angle) => `${x - 2 * size * Math.cos(turn + angle)} ${y - 2 * size * Math.sin(turn + angle)}`;
       const d = `M${x - dx} ${y + dy}L${x} ${y}M${tip(0.5)}L${x} ${y}L${tip(-0.5)}`;
-      nodes.push(shape("path", { d, "stroke-width": size / 2 }, "moved"));
+      nodes.push(shape("path", { d, "stroke-width": 1.2 * size }, "halo"), shape("path", { d, "stroke-width": size / 2 }, "moved"));
     }
   }
-  nodes.push(...robots(size), ...scale(size));
+  nodes.push(...robots(size)); // their names come before those of landmarks
+  for (const one of named.slice(0, MOST_NAMES)) {
+    const left = one.x_m > view.x + 0.75 * view.w, words = one === hovered ? `${one.label} ${about(one)}` : one.label;
+    const node = label(one.x_m + (left ? -1.6 : 1.6) * size, -one.y_m - 1.2 * size, size, words);
+    node.setAttribute("class", "label name");
+    if (left) node.setAttribute("text-anchor", "end");
+    nodes.push(node);
+  }
   $("map").setAttribute("viewBox", `${view.x} ${view.y} ${view.w} ${view.h}`);
-  $("map").replaceChildren(...nodes);
+  $("map").replaceChildren(...nodes, ...scale(size));
+  paintMarks();
+}
+
+const about = (one) => `${one.label.startsWith(one.class || "") ? "" : `${one.class}, `}${percent(one.p_exists)}`;
+
+// Several moves of a finger between two frames are drawn once.
+function repaint() { if (!painting) { painting = true; requestAnimationFrame(paint); } }
+
+// Which class looks like what, and how many of it exist.
+function legend() {
+  for (const name of [...new Set(placed.map((one) => one.class || ""))].sort()) if (!kinds.includes(name)) kinds.push(name);
+  const counts = kinds.map((name) => placed.filter((one) => (one.class || "") === name && one.p_exists >= 0.5).length);
+  $("classes").replaceChildren(...kinds.map((name, k) => {
+    const [form, colour] = looks(name), svg = shape("svg", { viewBox: "-1.5 -1.5 3 3", "aria-hidden": "true" }, "symbol");
+    svg.append(shape("path", { d: SHAPES[form] }, `c${colour}`));
+    return element("span", "", svg, ` ${name || "without a class"}, ${counts[k]}`);
+  }));
+}
+
+// The landmark nearest to a place, if that is within so many pixels of it.
+function nearest([x, y], pixels) {
+  const far = (one) => Math.hypot(one.x_m - x, -one.y_m - y);
+  const near = placed.reduce((best, one) => (best && far(best) <= far(one) ? best : one), null);
+  return near && far(near) < pixels * metre() ? near : null;
+}
+
+// Name on the map what is typed: all landmarks that are called so, or begin so, or are of that class.
+function search() {
+  const text = $("name").value.trim().toLowerCase(), starts = (one) => one.toLowerCase().startsWith(text);
+  searched = new Set(text ? placed.filter((one) => starts(one.label) || starts(one.class || "")) : []);
+  repaint();
 }
 
 function label(x, y, size, words) {
@@ -228,7 +302,7 @@ function look(scale, [x, y] = [view.x + view.w / 2, view.y + view.h / 2], to = [
   view.x = Math.min(Math.max(view.x, whole.x - view.w / 2), whole.x + whole.w - view.w / 2);
   view.y = Math.min(Math.max(view.y, whole.y - view.h / 2), whole.y + whole.h - view.h / 2);
   $("map").classList.toggle("near", view.w < whole.w); // then one finger moves the map, and not the page
-  requestAnimationFrame(paint);
+  repaint();
 }
 
 function showAll() { view = { ...whole }; $("map").classList.remove("near"); paint(); }
@@ -247,7 +321,11 @@ function handle() {
     map.setPointerCapture(event.pointerId);
   });
   map.addEventListener("pointermove", (event) => {
-    if (!fingers.has(event.pointerId)) return;
+    if (!fingers.has(event.pointerId)) {
+      const near = event.pointerType === "mouse" ? nearest(at([event.clientX, event.clientY]), 12) : null;
+      if (near !== hovered) { hovered = near; repaint(); }
+      return;
+    }
     const [from, wide] = middle();
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     const [to, now] = middle();
@@ -256,10 +334,10 @@ function handle() {
   });
   map.addEventListener("pointerup", (event) => {
     if (fingers.size > 1 || drift > 6) return;
-    const [x, y] = at([event.clientX, event.clientY]), far = (one) => Math.hypot(one.x_m - x, -one.y_m - y);
-    const near = placed.reduce((best, one) => (best && far(best) <= far(one) ? best : one), null);
-    if (near && far(near) < 24 * metre()) why(near.label);
+    const near = nearest(at([event.clientX, event.clientY]), 24);
+    if (near) why(near.label);
   });
+  map.addEventListener("pointerleave", () => { if (hovered) { hovered = null; repaint(); } });
   for (const end of ["pointerup", "pointercancel"]) map.addEventListener(end, (event) => fingers.delete(event.pointerId));
   map.addEventListener("wheel", (event) => {
     if (!event.ctrlKey && document.activeElement !== map) return; // the page scrolls
@@ -445,9 +523,18 @@ async function beside() {
   const newer = map.head - approved, who = map.approved ? `by ${map.approved.who}, ${minute(map.approved.at)}` : "";
   $("approved").textContent = `${approved ? `Revision ${approved} is approved (${who})` : "No revision is approved"}; ${newer > 0 ? `${newer} newer` : "none is newer"}.`;
   candidates();
-  list("jobs", jobs.length ? jobs.map((job) => `${job.id} of ${job.robot}: ${job.state}${job.reason ? `, ${job.reason}` : ""}`) : ["none yet"]);
+  tableOfJobs(jobs);
   held = robots;
   tableOfRobots();
+}
+
+const STATES = { queued: "… waits", working: "… is entered", entered: "✓ entered", repeat: "= in the map already", aside: "△ set aside", rejected: "✕ rejected" };
+
+function tableOfJobs(jobs) {
+  $("uploads").textContent = jobs.length ? "" : "None yet.";
+  const became = (job) => (job.state === "entered" && job.revision !== null ? `, revision ${job.revision}` : "");
+  table("jobs", ["Session", "Robot", "Uploaded (UTC)", "State", "Verdict", "Remarks"], jobs.map((job) => [
+    String(job.id), job.robot, minute(job.created_at), `${STATES[job.state] ?? job.state}${became(job)}`, job.verdict || "–", job.remarks || "–"]));
 }
 
 // Robots by the revision that they use, as they report, and where their newest sessions ended.
@@ -491,7 +578,7 @@ async function follow() {
 }
 
 async function choose() {
-  [site, tile, chosen, compares, order, revisions, fleet] = [$("site").value, null, null, false, [], [], []];
+  [site, tile, chosen, compares, order, revisions, fleet, kinds] = [$("site").value, null, null, false, [], [], [], []];
   $("map").classList.remove("near");
   $("why").textContent = "Choose a landmark.";
   $("word").hidden = true;
@@ -517,6 +604,7 @@ async function start() {
 }
 
 $("enter").addEventListener("submit", (event) => { event.preventDefault(); token = $("token").value; start(); });
+$("name").addEventListener("input", search);
 $("find").addEventListener("submit", (event) => { event.preventDefault(); goTo($("name").value); });
 $("approve").addEventListener("submit", async (event) => {
   event.preventDefault();
@@ -539,5 +627,6 @@ $("time").addEventListener("input", () => {
   picks += 1;
   show();
 });
+for (const [what, event] of [[window, "resize"], [matchMedia("(prefers-color-scheme: dark)"), "change"]]) what.addEventListener(event, () => { if (view) repaint(); });
 handle();
 if (token) start();

@@ -20,7 +20,7 @@ import numpy as np
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, Landmarks, MapChange, Progress
 from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.partial_views.table import as_markdown
 from evermap_studies.rows import RowsFile, run_missing
@@ -175,10 +175,12 @@ def live(settings: Settings, seed: int, patrol_s: int) -> Row:
     living: LivingMap | None = None
     told: list[Row] = []
     after: list[Row] = []
+    beliefs: list[tuple[float, bool, bool]] = []
     forecasts: list[tuple[float, bool]] = []
     for k, recording in enumerate(building.sessions):
         session = run_session(recording, living)
         living = session.living
+        pose = truth.alignment(living, k)
         told += [
             {
                 "session": k,
@@ -188,12 +190,13 @@ def live(settings: Settings, seed: int, patrol_s: int) -> Row:
                 "true": truth.changed_within(name, change.stamp_from_s, k),
                 "never": bool(truth.never[name]),
                 "looks": change.n_hits + change.n_misses,
+                **truth.displacement_scores(change, name, k, pose),
             }
             for change in session.changes
             for name in change.landmark_ids
         ]
-        pose = truth.alignment(living, k)
         after.append({"session": k, "found": session.found, **truth.map_scores(living, k, pose)})
+        beliefs += truth.beliefs(living, k, pose)
         if k + 1 < len(building.sessions):
             forecasts += truth.forecasts(living, k, pose)
     return {
@@ -203,6 +206,7 @@ def live(settings: Settings, seed: int, patrol_s: int) -> Row:
         "after": after,
         "changes": truth.looked_at_changes(told),
         "forecasts": forecasts,
+        "beliefs": beliefs,
     }
 
 
@@ -233,9 +237,46 @@ class _Truth:
 
     def changed_within(self, name: int, from_s: float, session: int) -> bool:
         """Whether a landmark changed between the session that begins before a stamp and another."""
-        first = int(np.searchsorted(self.start_s, from_s, side="right")) - 1 if np.isfinite(from_s) else 0
-        path = self.position_m[max(first, 0) : session + 1, name]
+        path = self.position_m[self._session_at(from_s) : session + 1, name]
         return bool(np.any(~_same(path[1:], path[:-1])))
+
+    def _session_at(self, stamp_s: float) -> int:
+        """The newest session that begins by a stamp; the first where there is none."""
+        return max(int(np.searchsorted(self.start_s, stamp_s, side="right")) - 1, 0) if np.isfinite(stamp_s) else 0
+
+    def displacement_scores(self, change: MapChange, name: int, session: int, pose: FloatArray) -> Row:
+        """By how much a landmark moved that is told to have moved, how far off that is [m], and how many squared
+        standard deviations; nothing of another change, and of what was not there before and after.
+        """
+        if change.kind is not ChangeKind.MOVED or not change.displacement_covariance_m2:
+            return {}
+        path = self.position_m[self._session_at(change.stamp_from_s) : session + 1, name]
+        moved, told = path[-1] - path[0], se2.rotation(float(pose[2])) @ np.asarray(change.displacement_m)
+        error, turn = told - moved, se2.rotation(float(pose[2]))
+        if len(change.landmark_ids) > 1 or not np.isfinite(moved).all():  # of a body it is that of its middle
+            return {}
+        spread = turn @ np.array(change.displacement_covariance_m2) @ turn.T
+        squared = float(error @ np.linalg.solve(spread, error))
+        return {"moved_m": float(np.hypot(*moved)), "error_m": float(np.hypot(*error)), "squared": squared}
+
+    def beliefs(self, living: LivingMap, session: int, pose: FloatArray) -> list[tuple[float, bool, bool]]:
+        """For every landmark that the map knows: P(exists), whether it stands at one of its known places, and whether
+        this session saw it. Left out is what has no place where its body stands most probably.
+        """
+        places, members, found = living.places, living.members, []
+        known = living.place_row(members.landmark_id, living.site_of()) >= 0
+        stands = self.position_m[session, places.landmark_id]
+        gap = np.hypot(*(se2.transform(pose, places.position_m) - stands).T)
+        right = np.unique(places.landmark_id[gap < OUTLIER_M])  # False for nan
+        last = dict(zip(living.sites.site_id.tolist(), living.sites.seen_s.tolist(), strict=True))
+        seen = {
+            name
+            for name, site in zip(places.landmark_id.tolist(), places.site_id.tolist(), strict=True)
+            if last[site] >= self.start_s[session]
+        }
+        for name, p in zip(members.landmark_id[known].tolist(), living.p_exists()[known].tolist(), strict=True):
+            found.append((p, bool(np.isin(name, right)), name in seen))
+        return found
 
     def alignment(self, living: LivingMap, session: int) -> FloatArray:
         """(3,) the map in the frame of the truth, by the landmarks that lie where they stand."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,47 @@ def reliability(told: Iterable[Row]) -> list[tuple[float, float, int]]:
     ]
 
 
+def calibration(told: Iterable[Row]) -> list[list[str]]:
+    """Changes told by kind: number, mean probability, share true, and of those above .99 the number and the share."""
+    rows, lines = list(told), []
+    for kind in sorted({row["kind"] for row in rows}):
+        of_kind = [row for row in rows if row["kind"] == kind]
+        sure = [row for row in of_kind if row["p"] > 0.99]
+        means = (_mean([row["p"] for row in of_kind]), _mean([row["true"] for row in of_kind]))
+        sure_true = number("{:.3f}", _mean([row["true"] for row in sure]))
+        lines.append([kind, f"{len(of_kind)}", *(number("{:.3f}", m) for m in means), f"{len(sure)}", sure_true])
+    return lines
+
+
+def beliefs(worlds: Iterable[Row]) -> list[list[str]]:
+    """P(exists) of what the newest session saw and of what it did not, in ten bins: mean, share that stands, number."""
+    pairs = np.array([row for world in worlds for row in world.get("beliefs", ())], dtype=np.float64).reshape(-1, 3)
+    lines = []
+    for seen, word in ((1.0, "seen"), (0.0, "not seen")):
+        for p, share, count in reliability({"p": p, "true": t} for p, t, s in pairs.tolist() if s == seen):
+            lines.append([word, f"{p:.3f}", f"{share:.3f}", f"{count}"])
+    return lines
+
+
+SIZES_M = (0.0, 0.05, 0.15, 0.3, 1.0, np.inf)
+
+
+def displacements(worlds: Iterable[Row]) -> list[list[str]]:
+    """Displacements told of single landmarks, by how far they moved: number, RMSE [m], NEES over its expectation."""
+    rows = [row for world in worlds for row in world["told"] if "squared" in row]
+    lines = []
+    for low, high in pairwise(SIZES_M):
+        some = [row for row in rows if low <= row["moved_m"] < high]
+        if some:
+            error = _root(_mean([row["error_m"] ** 2 for row in some]))
+            nees = [row["squared"] / 2.0 for row in some]
+            name = f"{low:g} to {high:g} m" if np.isfinite(high) else f"from {low:g} m"
+            lines.append(
+                [name, f"{len(some)}", number("{:.3f}", error), f"{np.mean(nees):.2f}", f"{np.median(nees):.2f}"]
+            )
+    return lines
+
+
 def as_markdown(table: Mapping[str, Any]) -> str:
     """All tables."""
     lines = []
@@ -95,9 +137,16 @@ def as_markdown(table: Mapping[str, Any]) -> str:
             for p, share_true, count in reliability(row for world in worlds for row in world["told"]):
                 bins.append([name, f"{p:.3f}", f"{share_true:.3f}", f"{count}"])
     still = [_still_line(name, summary(worlds), worlds) for name, worlds in by_patrol(table, "still").items()]
+    plain = by_patrol(table).get(PLAIN, [])
     parts = (
         (header, lines),
         (("patrols", "mean p told", "share true", "changes"), bins),
+        (
+            ("kind", "told", "mean p told", "share true", "with p > .99", "of these true"),
+            calibration(row for world in plain for row in world["told"]),
+        ),
+        (("by the newest session", "mean P(exists)", "share that stands", "landmarks"), beliefs(plain)),
+        (("moved by", "told", "error [m]", "NEES / 2", "median"), displacements(plain)),
         (("nothing changes; patrols", "sessions", "not found", "told", "highest p", "precision, p >= .9"), still),
     )
     return "\n\n".join(markdown_table(head, rows) for head, rows in parts if rows)
