@@ -14,13 +14,16 @@ from evermap.io import write_native
 from evermap.pipeline import run_slam
 from evermap.runs.track.detections import read_input
 from evermap.tracking.frame import DetectionTable
-from evermap.tracking.record import StaticSpells
-from evermap.tracking.run import make_tracker, run_track
+from evermap.tracking.record import Event, SpellLog, StaticSpells
+from evermap.tracking.run import find_misses, make_tracker, run_track
+from evermap.tracking.standing import Stood, join_stood
 from evermap.tracking.tracker import Tracker
+from evermap.tracking.tracklets import EventKind
 from evermap.tracking.views import View
-from evermap.types import FloatArray
+from evermap.types import UNKNOWN, FloatArray
 from evermap_studies.worlds.parking import StreetConfig, StreetRun, simulate_street
 
+COLUMNS = ("track_id", "class_id", "position_m", "elsewhere_s", "first_s", "last_s", "gone_s")
 SEEN = TrackConfig(range_m=30.0, fov_deg=110.0)
 PARKED_M = 3.0
 """Farthest that a spell is from its slot, at the odometry's drift."""
@@ -134,3 +137,77 @@ def test_what_the_tracker_took_for_rest_is_forgotten_unless_it_was_long() -> Non
     assert len(short.static_spells()) == 0
     tracker.confirm_rest(nothing, 0.0)
     assert len(tracker.static_spells()) == 1  # 2.4 s
+
+
+def spells_of(*rows: tuple[int, float, float, float, float]) -> StaticSpells:
+    """Spells by track, elsewhere, first, last, gone."""
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+    whole = columns[0].astype(np.int64)
+    return StaticSpells(whole, np.zeros_like(whole), np.zeros((len(whole), 3)), *columns[1:])
+
+
+def test_ended_spells_begin_with_the_stay_and_short_ones_need_one() -> None:
+    log = SpellLog()
+    earlier = (0, -np.inf, 1.0, 1.5, 3.0)
+    crept, confirmed = (1, -np.inf, 11.0, 12.0, 15.0), (2, 9.0, 12.0, 13.0, 15.0)
+    long, arrived = (3, -np.inf, 11.0, 14.0, 15.0), (4, 11.5, 12.0, 13.0, 15.0)
+    log.restore({name: getattr(spells_of(earlier, crept, confirmed, long, arrived), name) for name in COLUMNS})
+    stays = spells_of(
+        (2, -np.inf, 10.0, 13.0, np.inf), (4, -np.inf, 11.0, 13.0, np.inf), (5, -np.inf, 11.0, 13.0, np.inf)
+    )
+    assert log.confirm(stays, 10.0, 2.0).tolist() == [True, True, False]
+    kept = log.columns()
+    assert kept["track_id"].tolist() == [0, 2, 3, 4]
+    assert kept["first_s"].tolist() == [1.0, 10.0, 11.0, 12.0]  # 4 was elsewhere later than the stay begins
+
+
+def test_stays_of_who_is_neither_followed_nor_stored_have_ended() -> None:
+    tracker = Tracker(boxes=True)
+    tracker.step(0.0, np.zeros((1, 3)), box=np.ones((1, 4)))
+    stay = spells_of((77, -np.inf, 3.0, 4.0, 9.0))
+    tracker.confirm_rest(stay, 0.0)
+    found = tracker.static_spells()
+    assert (found.track_id.tolist(), found.first_s.tolist(), found.gone_s.tolist()) == ([77], [3.0], [9.0])
+
+
+def test_rest_that_is_confirmed_begins_with_the_stay_and_earlier_days_are_not_asked() -> None:
+    tracker = Tracker(boxes=True)
+    for k in range(35):
+        tracker.step(100.0 + 0.1 * k, np.zeros((1, 3)), box=np.ones((1, 4)))
+    nothing = spells_of()
+    tracker.confirm_rest(nothing, 200.0)
+    before = tracker.static_spells()
+    assert before.first_s.tolist() == [pytest.approx(102.0)]
+    name = int(before.track_id[0])
+    tracker.confirm_rest(spells_of((name, 99.7, 100.1, 103.4, np.inf)), 100.0)
+    after = tracker.static_spells()
+    assert (after.elsewhere_s.tolist(), after.first_s.tolist()) == ([99.7], [100.1])
+    assert (after.last_s[0], after.gone_s[0]) == (before.last_s[0], np.inf)
+
+
+def test_misses_are_of_those_that_were_stored_last() -> None:
+    told = [
+        (1, EventKind.STORED, 5.0), (1, EventKind.DIED, 9.0), (2, EventKind.DIED, 9.0), (3, EventKind.STORED, 5.0),
+        (3, EventKind.REIDENTIFIED, 6.0), (3, EventKind.DIED, 9.0), (4, EventKind.STORED, 5.0),
+    ]  # fmt: skip
+    events = [Event(stamp_s, kind, name) for name, kind, stamp_s in told]
+    np.testing.assert_array_equal(find_misses(events, np.arange(1, 5)), [9.0, np.inf, np.inf, np.inf])
+
+
+@pytest.mark.parametrize(("off_m", "left_s", "stays"), [(0.2, np.nan, 1), (0.8, np.nan, 2), (0.2, 3.0, 2)])
+def test_a_track_that_stands_where_it_stood_goes_on_after_a_gap(off_m: float, left_s: float, stays: int) -> None:
+    """Unless it was seen to leave; one that moves in a part is as little still as it is there."""
+
+    def part(track: int, until_s: float, p: float) -> Stood:
+        stay, unseen = np.array([UNKNOWN, 0, 0]), np.array([np.nan])
+        return Stood(stay, np.full(3, p), {track: p}, np.array([track]), np.array([p]), unseen, np.array([until_s]))
+
+    parts = [part(7, left_s, 0.95), part(7, np.nan, 0.99)]
+    position_m = np.zeros((6, 3))
+    position_m[3:, 0] = off_m
+    joined = join_stood(parts, position_m, TrackConfig().still)
+    assert joined.stay.tolist() == [UNKNOWN, 0, 0, UNKNOWN, *[stays - 1] * 2]
+    assert joined.track.tolist() == [7] * stays
+    assert joined.p_still == {7: 0.95}
+    assert joined.p_stay.tolist() == ([0.99] if stays == 1 else [0.95, 0.99])
+    np.testing.assert_array_equal(joined.until_s, [np.nan] if stays == 1 else [left_s, np.nan])

@@ -225,9 +225,7 @@ def _find_standing(
         elsewhere_s=np.where(np.isnan(stood.since_s), -np.inf, stood.since_s - config.still.when_s),
         first_s=ends[:, 0],
         last_s=ends[:, 1],
-        gone_s=np.where(
-            np.isnan(stood.until_s), _find_misses(events, stood.track), stood.until_s + config.still.when_s
-        ),
+        gone_s=np.where(np.isnan(stood.until_s), find_misses(events, stood.track), stood.until_s + config.still.when_s),
     )
     tracker.confirm_rest(stays, float(table.stamp_s[frames.start]))
     return stood
@@ -390,7 +388,7 @@ def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s:
     return events
 
 
-def _find_misses(events: Sequence[Event], track_id: IntArray) -> FloatArray:
+def find_misses(events: Sequence[Event], track_id: IntArray) -> FloatArray:
     """Return (K,) when objects that rested out of view were missed in their places; inf where they were not."""
     stored, missed = set[int](), dict[int, float]()
     for event in events:

@@ -685,3 +685,19 @@ def test_what_stands_beside_or_has_an_identity_replaces_nothing(
 ) -> None:
     kinds = [one.kind for one in instead_of(new_m, texts)]
     assert kinds == [ChangeKind.VANISHED, ChangeKind.VANISHED, ChangeKind.APPEARED]
+
+
+def test_one_replaces_one() -> None:
+    """Of two that were missed beside a new one, the nearer one is replaced."""
+    texts = ("tree-3@10", "tree-4@10", "pole-4@100")
+    one, two, new = map(landmark_id_of, texts)
+    living = begun(found([1, one, two], [AT[1], (5.0, 0.0), (5.0, 0.3)])).living
+    living = replace(living, landmark_texts=tuple(sorted(texts)))
+    entry = next_map(living, found([1, new], [AT[1], (5.0, 0.2)], place=[0, -1], first_s=100.0, last_s=101.0))
+    told = [
+        MapChange((name,), ChangeKind.VANISHED, 50.0, 80.0, (np.nan, np.nan), 0.0, 0.97, 0, 7) for name in (one, two)
+    ]
+    changes = decide.join_replaced(tuple(told), entry)
+    assert [(change.kind, change.landmark_ids) for change in changes] == [
+        (ChangeKind.VANISHED, (one,)), (ChangeKind.REPLACED, (two, new)),
+    ]  # fmt: skip
