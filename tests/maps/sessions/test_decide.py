@@ -643,8 +643,12 @@ def test_one_in_the_place_of_another_is_one_change_or_none(p: float) -> None:
         assert one.displacement_m == pytest.approx((2.0, 0.1))
 
 
-def instead_of(new_m: tuple[float, float], texts: tuple[str, str], *, came: float | None = 0.6) -> list[MapChange]:
-    """What is told of a landmark that was missed at `AT[8]` and of a new one; `came`: the arrival is told, too."""
+def instead_of(
+    new_m: tuple[float, float], texts: tuple[str, str], *, came: float | None = 0.6, witnessed: str | None = None
+) -> list[MapChange]:
+    """What is told of a landmark that was missed at `AT[8]` and of a new one; `came`: the arrival is told, too; and
+    which of them was seen to leave or to arrive.
+    """
     old, new = map(landmark_id_of, texts)
     living = begun(found([1, 9, old], [AT[1], AT[9], AT[8]])).living
     living = replace(living, landmark_texts=tuple(sorted(one for one in texts if not one.isdigit())))
@@ -656,7 +660,11 @@ def instead_of(new_m: tuple[float, float], texts: tuple[str, str], *, came: floa
     ]
     if came is not None:
         told.append(MapChange((new,), ChangeKind.APPEARED, 50.0, 85.0, nothing, 0.0, came, 5, 0))
-    return list(decide.join_replaced(tuple(told), entry))
+    none = np.full(1, np.nan)
+    seen = (
+        Witnessed.nothing() if witnessed is None else Witnessed(np.array([landmark_id_of(witnessed)]), none, none, none)
+    )
+    return list(decide.join_replaced(tuple(told), seen, entry))
 
 
 @pytest.mark.parametrize("came", [0.6, None])
@@ -687,6 +695,22 @@ def test_what_stands_beside_or_has_an_identity_replaces_nothing(
     assert kinds == [ChangeKind.VANISHED, ChangeKind.VANISHED, ChangeKind.APPEARED]
 
 
+@pytest.mark.parametrize("witnessed", ["tree-3@10", "pole-4@100"])
+def test_who_was_seen_to_leave_or_to_come_replaces_nothing(witnessed: str) -> None:
+    kinds = [one.kind for one in instead_of((5.0, 0.2), ("tree-3@10", "pole-4@100"), witnessed=witnessed)]
+    assert kinds == [ChangeKind.VANISHED, ChangeKind.VANISHED, ChangeKind.APPEARED]
+
+
+def test_what_came_and_left_in_one_session_was_nowhere_before() -> None:
+    """Of a map's first session nothing is replaced."""
+    texts = ("tree-3@10", "pole-4@10")
+    old, new = map(landmark_id_of, texts)
+    entry = begun(found([old, new], [AT[8], (5.0, 0.1)]))
+    entry = replace(entry, living=replace(entry.living, landmark_texts=tuple(sorted(texts))))
+    told = (MapChange((old,), ChangeKind.VANISHED, 50.0, 80.0, (np.nan, np.nan), 0.0, 0.97, 0, 7),)
+    assert decide.join_replaced(told, Witnessed.nothing(), entry) == told
+
+
 def test_one_replaces_one() -> None:
     """Of two that were missed beside a new one, the nearer one is replaced."""
     texts = ("tree-3@10", "tree-4@10", "pole-4@100")
@@ -697,7 +721,7 @@ def test_one_replaces_one() -> None:
     told = [
         MapChange((name,), ChangeKind.VANISHED, 50.0, 80.0, (np.nan, np.nan), 0.0, 0.97, 0, 7) for name in (one, two)
     ]
-    changes = decide.join_replaced(tuple(told), entry)
+    changes = decide.join_replaced(tuple(told), Witnessed.nothing(), entry)
     assert [(change.kind, change.landmark_ids) for change in changes] == [
         (ChangeKind.VANISHED, (one,)), (ChangeKind.REPLACED, (two, new)),
     ]  # fmt: skip

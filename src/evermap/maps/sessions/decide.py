@@ -109,7 +109,7 @@ def with_replaced(
 
 
 def join_replaced(
-    changes: tuple[MapChange, ...], entry: Extended, settings: DecisionConfig = USUAL
+    changes: tuple[MapChange, ...], what: Witnessed, entry: Extended, settings: DecisionConfig = USUAL
 ) -> tuple[MapChange, ...]:
     """Return the changes with departures of landmarks without identity, where a new one stands, as replacements.
 
@@ -118,15 +118,18 @@ def join_replaced(
 
     Args:
         changes: of a session.
+        what: which were seen to leave or arrive: then both are facts.
         entry: the map before its beliefs were updated, with the session's landmarks.
         settings: how close to the former place the new one is.
     """
     living, before = entry.living, entry.before
     nameless = np.array([landmark_id_of(one) for one in living.landmark_texts if is_anonymous(one)], dtype=np.int64)
+    nameless = nameless[~np.isin(nameless, what.landmark_id)]
     taken = [name for one in changes if one.kind not in COMES for name in one.landmark_ids]
     new = np.isin(entry.landmark_id, nameless) & ~np.isin(entry.landmark_id, [*before.members.landmark_id, *taken])
     left = [k for k, one in enumerate(changes) if one.kind is ChangeKind.VANISHED and len(one.landmark_ids) == 1]
-    left = [k for k in left if changes[k].landmark_ids[0] in nameless]
+    mine = set(np.intersect1d(nameless, before.members.landmark_id).tolist())
+    left = [k for k in left if changes[k].landmark_ids[0] in mine]
     if not left or not new.any():
         return changes
     names, at_m = entry.landmark_id[new], living.places.position_m[entry.place[new]]
