@@ -49,6 +49,7 @@ def run_slam(
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
+    from evermap.slam.moving_bodies import without_motion
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.up import with_known_up
 
@@ -65,8 +66,11 @@ def run_slam(
     if has_traffic(recording):
         result = run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
         return with_verdict(result, recording, config.slam, findings=found)
-    given = Inputs.of(recording, prior_map)
     is_read_well = recording.detections is read.detections and all(finding.usable for finding in found)
+    if not is_in_space(recording):
+        recording, moved = without_motion(recording, config)
+        remarks = (*remarks, *moved)
+    given = Inputs.of(recording, prior_map)
 
     def conclude(**more: Any) -> SlamResult:
         visit, result, under = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
@@ -208,11 +212,14 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     """
     from evermap.maps.sessions import nameless, planar, session
     from evermap.slam import check, estimate
+    from evermap.slam.moving_bodies import without_motion
 
     recording, remarks, found = check.screened(nameless.without_ids(recording, config), config, repair=True)
     recording = session.admit_recording(recording, living)
     if config.slam.unknown_ids:
         recording = session.admit_recording(nameless.named_in(recording, living, config), living)
+    recording, moved = without_motion(recording, config)
+    remarks = (*remarks, *moved)
     solved = estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
     return replace(solved, findings=found)
 

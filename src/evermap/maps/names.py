@@ -63,6 +63,11 @@ def anonymous_text(kind: str, number: int, start_s: float) -> str:
     return f"{kind or NAMELESS}-{number}@{start}"
 
 
+def is_anonymous(text: str) -> bool:
+    """Return whether a landmark's identity is one of `anonymous_text`."""
+    return _ANONYMOUS.fullmatch(text) is not None
+
+
 def distinct_text(text: str, taken: Collection[str]) -> str:
     """Return a text, or with '#2', '#3' ... the first that is not taken: two robots may begin in one instant."""
     every = (f"{text}#{number}" for number in count(2))

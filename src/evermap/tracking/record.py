@@ -189,6 +189,10 @@ class StaticSpells(InSpace):
     last_s: FloatArray
     gone_s: FloatArray
 
+    def covers(self, track_id: int, first_s: float, last_s: float) -> BoolArray:
+        """Return (K,) which spells are of an object and overlap a time."""
+        return np.asarray((self.track_id == track_id) & (self.first_s <= last_s) & (self.last_s >= first_s))
+
 
 class SpellLog:
     """Static spells that have ended, in the order in which they did."""
@@ -208,6 +212,26 @@ class SpellLog:
         """Note rows of the working set whose objects are gone."""
         if len(rows):
             self._parts.append(_spells(stored, rows, stored.class_id, stored.position, gone_s))
+
+    def confirm(self, stays: StaticSpells, since_s: float, least_s: float) -> BoolArray:
+        """Return (K,) which stays overlap a spell that ended from `since_s` on, which begins with them; others that are
+        shorter than `least_s` are forgotten.
+        """
+        ended, known = self._join_ended(), np.zeros(len(stays), dtype=np.bool_)
+        kept = (ended.last_s < since_s) | (ended.last_s - ended.first_s >= least_s)
+        for k in np.flatnonzero(ended.last_s >= since_s).tolist():
+            mine = stays.covers(ended.track_id[k], ended.first_s[k], ended.last_s[k])
+            known |= mine
+            kept[k] |= mine.any()
+            first = stays.first_s[mine].min(initial=ended.first_s[k])
+            if first > ended.elsewhere_s[k]:
+                ended.first_s[k] = first
+        self._parts = [ended[kept]]
+        return known
+
+    def add_ended(self, spells: StaticSpells) -> None:
+        """Note spells."""
+        self._parts.append(spells)
 
     def columns(self) -> dict[str, Any]:
         """Return what `restore` takes."""

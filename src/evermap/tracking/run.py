@@ -21,9 +21,10 @@ from evermap.survival.text import parse_prior
 from evermap.tracking.field_of_view import find_field_of_view
 from evermap.tracking.frame import DetectionTable, p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
+from evermap.tracking.standing import Stood, join_stood, standing
 from evermap.tracking.state_file import State, read_state
 from evermap.tracking.tracker import Tracker
-from evermap.tracking.tracklets import TrackState
+from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
@@ -54,7 +55,8 @@ class TrackResult(Shown):
         seconds: wall time of the tracker.
         warnings: remarks.
         p_static: (R,) of each row of `tracks` the probability that its object stood from first to last, nan where it
-            was too short; None where nobody asked (`tracking.standing`).
+            was too short; None of points.
+        stood: which boxes stood, by all of their detections (`tracking.standing`); None of points.
     """
 
     table: DetectionTable
@@ -69,6 +71,7 @@ class TrackResult(Shown):
     seconds: float
     warnings: tuple[str, ...]
     p_static: FloatArray | None = None
+    stood: Stood | None = None
 
     def to_pandas(self) -> Any:
         """Return a data frame with a row an object and frame.
@@ -158,7 +161,7 @@ def run_track(
         tracker = make_tracker(table, config, confusion=confusion)
     table = _with_classes(table, tracker.class_names)
     start = perf_counter()
-    recorder, track_of_detection, n_gaps, seen = _follow(tracker, table, config, progress)
+    recorder, track_of_detection, n_gaps, seen, stood = _follow(tracker, table, config, progress)
     tracks = recorder.tracks() if table.score is None else recorder.at_once(config.p_dead)
     if not (tracks.state != TrackState.BIRTH).any():
         hint = f"fewer detections for confirmation: track.warm_up={max(1, config.warm_up - 1)}"
@@ -167,15 +170,17 @@ def run_track(
         raise DataError(
             "no object was seen often enough to be distinguished from false alarms", path=table.source, hint=hint
         )
-    spells = tracker.static_spells()  # a slow object passes the test for rest again and again, but does not rest
-    spells = spells[spells.last_s - spells.first_s >= config.rest_for_s]
-    lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
     confirmed = np.isin(track_of_detection, tracks.track_id[tracks.state != TrackState.BIRTH])
+    track_of_detection = np.where(confirmed, track_of_detection, UNKNOWN)
+    spells = tracker.static_spells()
+    if stood is None:  # a slow object passes the test for rest again and again, but does not rest
+        spells = spells[spells.last_s - spells.first_s >= config.rest_for_s]
+    lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
     return TrackResult(
         table=table,
         config=config,
         tracks=tracks,
-        track_of_detection=np.where(confirmed, track_of_detection, UNKNOWN),
+        track_of_detection=track_of_detection,
         events=tuple(recorder.events),
         spells=spells,
         lifetimes=lifetimes,
@@ -183,7 +188,47 @@ def run_track(
         n_gaps=n_gaps,
         seconds=perf_counter() - start,
         warnings=(*_remarks(table, config, spells), *seen, *_describe_returns(spells, config.place_sigma_m)),
+        p_static=None if stood is None else np.array([stood.p_still.get(k, np.nan) for k in tracks.track_id.tolist()]),
+        stood=stood,
     )
+
+
+def _find_standing(
+    tracker: Tracker,
+    table: DetectionTable,
+    frames: slice,
+    track_of_detection: IntArray,
+    events: Sequence[Event],
+    config: TrackConfig,
+) -> Stood:
+    """Return which boxes (M,) of some frames stood by all of their detections, and correct the tracker by it.
+
+    The tracker's own test needs seconds, since it sees no later detection: whoever drives past sees a parked car for
+    less.
+    """
+    rows = slice(int(table.first[frames.start]), int(table.first[frames.stop]))
+    frame = np.repeat(np.arange(table.n_frames), np.diff(table.first))[rows]
+    stamp_s, position_m, class_id = table.stamp_s[frame], table.position_m[rows], table.class_id[rows]
+    speeds, unknown = tracker.settings.class_speeds(len(tracker.class_names)), class_id == UNKNOWN
+    limit = np.where(unknown, np.median(speeds), speeds[np.where(unknown, 0, class_id)])
+    range_m = np.zeros(len(frame))
+    if table.sensor_m is not None:
+        range_m = np.linalg.norm(position_m - table.sensor_m[frame], axis=1)
+    stood = standing(stamp_s, position_m, range_m, track_of_detection, limit, config.still)
+    mine = [np.flatnonzero(stood.stay == k) for k in range(len(stood.track))]
+    classes = [class_id[one][class_id[one] != UNKNOWN] for one in mine]
+    ends = np.array([stamp_s[one[[0, -1]]] for one in mine]).reshape(-1, 2)
+    stays = StaticSpells(
+        track_id=stood.track,
+        class_id=np.array([np.bincount(one).argmax() if len(one) else 0 for one in classes], dtype=np.int64),
+        position_m=np.array([np.median(position_m[one], axis=0) for one in mine]).reshape(-1, 3),
+        elsewhere_s=np.where(np.isnan(stood.since_s), -np.inf, stood.since_s - config.still.when_s),
+        first_s=ends[:, 0],
+        last_s=ends[:, 1],
+        gone_s=np.where(np.isnan(stood.until_s), find_misses(events, stood.track), stood.until_s + config.still.when_s),
+    )
+    tracker.confirm_rest(stays, float(table.stamp_s[frames.start]))
+    return stood
 
 
 def make_tracker(
@@ -279,8 +324,10 @@ def _check_classes(by_class: Mapping[str, object], class_names: Sequence[str], f
 
 def _follow(
     tracker: Tracker, table: DetectionTable, config: TrackConfig, progress: Callable[[float, float], None] | None
-) -> tuple[Recorder, IntArray, int, list[str]]:
-    """Frame after frame; between them, where there was no look for long, blind ones. With remarks on what was seen."""
+) -> tuple[Recorder, IntArray, int, list[str], Stood | None]:
+    """Frame after frame; between them, where there was no look for long, blind ones. With remarks on what was seen, and
+    with which boxes stood: judged before each such time, as if it were the end.
+    """
     noise = table.covariance_m2
     if noise is not None:
         noise = np.where(np.isnan(noise), config.sigma_position_m**2 * np.eye(3), noise)
@@ -289,9 +336,20 @@ def _follow(
     recorder, found, n_gaps, centre_m = Recorder(), np.full(len(table), UNKNOWN), 0, np.zeros(3)
     sees = None if config.range_m is None else find_field_of_view(table, config)
     p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
+    begin, parts, earlier = 0, list[Stood](), tracker.n_objects
+
+    def judge(end: int) -> None:
+        if table.box is not None and end > begin:
+            rows = slice(int(table.first[begin]), int(table.first[end]))
+            real = np.isin(found[rows], [one.track_id for one in recorder.events if one.kind == EventKind.BORN])
+            of = np.where(real | (found[rows] < earlier), found[rows], UNKNOWN)
+            parts.append(_find_standing(tracker, table, slice(begin, end), of, recorder.events, config))
+
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
         if np.isfinite(tracker.stamp_s) and stamp_s - tracker.stamp_s > gap_s:
             n_gaps += 1
+            judge(k)
+            begin = k
             recorder.events.extend(_close_eyes(tracker, centre_m, tracker.stamp_s, stamp_s, min(step_s, gap_s)))
         rows = slice(int(table.first[k]), int(table.first[k + 1]))
         view, centre_m = None, centre_m if table.sensor_m is None else table.sensor_m[k]
@@ -311,7 +369,9 @@ def _follow(
         recorder.add(tracker.followed(), events)
         if progress and k % 100 == 99:
             progress(k + 1, table.n_frames)
-    return recorder, found, n_gaps, [sees.remark] if sees is not None and sees.remark else []
+    judge(table.n_frames)
+    remarks = [sees.remark] if sees is not None and sees.remark else []
+    return recorder, found, n_gaps, remarks, join_stood(parts, table.position_m, config.still) if parts else None
 
 
 def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
@@ -328,8 +388,22 @@ def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s:
     return events
 
 
+def find_misses(events: Sequence[Event], track_id: IntArray) -> FloatArray:
+    """Return (K,) when objects that rested out of view were missed in their places; inf where they were not."""
+    stored, missed = set[int](), dict[int, float]()
+    for event in events:
+        if event.kind == EventKind.STORED:
+            stored.add(event.track_id)
+        elif event.kind == EventKind.DIED and event.track_id in stored:
+            missed[event.track_id] = event.stamp_s
+        else:
+            stored.discard(event.track_id)
+    return np.array([missed.get(name, np.inf) for name in track_id.tolist()])
+
+
 def _lifetimes(spells: StaticSpells, rest_for_s: float) -> tuple[CensoredLifetimes | None, IntArray]:
-    if not np.isfinite(spells.elsewhere_s).any():  # it is known of none when it can have begun
+    long = spells.last_s - spells.first_s >= rest_for_s
+    if not (long & np.isfinite(spells.elsewhere_s)).any():  # it is known of none when it can have begun
         return None, np.zeros(0, dtype=np.int64)
     return lifetimes_of_sightings(
         spells.elsewhere_s, spells.first_s, spells.last_s, spells.gone_s, least_stay_s=rest_for_s

@@ -7,6 +7,7 @@ makes of a changing view; the ratio of the two densities is the Bayes factor (Di
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,31 @@ class Stood(NamedTuple):
     p_stay: FloatArray
     since_s: FloatArray
     until_s: FloatArray
+
+
+def join_stood(parts: Sequence[Stood], position_m: FloatArray, settings: StillConfig) -> Stood:
+    """Return the same of successive detections (M,), at (M, 3): a track that stands where it stood goes on."""
+    stay, p_still, rows, last = list[IntArray](), dict[int, float](), list[tuple[float, ...]](), dict[int, int]()
+    place, begin = list[FloatArray](), 0
+    for part in parts:
+        new = np.full(len(part.track) + 1, UNKNOWN)  # the last is of no stay
+        at = position_m[begin : begin + len(part.stay), :2]
+        for k, (name, p, since_s, until_s) in enumerate(zip(*(column.tolist() for column in part[3:]), strict=True)):
+            here, before = np.median(at[part.stay == k], axis=0), last.get(name, UNKNOWN)
+            goes_on = before != UNKNOWN and np.isnan(since_s) and np.isnan(rows[before][3])
+            if goes_on and np.linalg.norm(here - place[before]) < settings.same_m:
+                rows[before] = name, max(p, rows[before][1]), rows[before][2], until_s
+            else:
+                last[name] = before = len(rows)
+                rows.append((name, p, since_s, until_s))
+                place.append(here)
+            new[k] = before
+        stay.append(new[part.stay])
+        p_still |= {name: min(p, p_still.get(name, 1.0)) for name, p in part.p_still.items()}
+        begin += len(part.stay)
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    p_static = np.concatenate([part.p_static for part in parts])
+    return Stood(np.concatenate(stay), p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
 
 
 def standing(

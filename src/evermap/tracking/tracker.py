@@ -252,6 +252,11 @@ class Tracker(Shown):
         """Stamp of the last frame, -inf before the first."""
         return self._stamp_s
 
+    @property
+    def n_objects(self) -> int:
+        """Number of objects so far; each has an id below it."""
+        return self._next_id
+
     def __len__(self) -> int:
         """Return the number of active tracklets."""
         return self._n
@@ -361,6 +366,43 @@ class Tracker(Shown):
     def static_spells(self) -> StaticSpells:
         """Return all static spells so far: those that have ended, and those that go on, whose end is open."""
         return self._spells.with_open(self._tracklets, self._n, self.working_set)
+
+    def confirm_rest(self, stays: StaticSpells, since_s: float) -> None:
+        """Correct what rests by all detections of a recording, of which each frame knew the earlier ones alone.
+
+        Stays of objects that are followed or stored become their spells, with the beginning that was seen; those of
+        others are spells that have ended. Of this recording, spells that nothing confirms and that are shorter than
+        `rest_for_s` were not at rest.
+
+        Args:
+            stays: that all detections show, bounds of their ends as far as they were seen.
+            since_s: begin of the recording.
+        """
+        least_s, w = self.settings.rest_for_s, self.working_set
+        spare = ~self._spells.confirm(stays, since_s, least_s)
+        for table, rows, place in (
+            (self._tracklets, np.arange(self._n), self._tracklets.rest_mean),
+            (w.stored, w.rows, w.stored.position),
+        ):
+            for row in rows[table.rest_seen_s[rows] >= since_s].tolist():
+                mine = np.flatnonzero(
+                    stays.covers(table.track_id[row], table.rest_since_s[row], table.rest_seen_s[row])
+                )
+                if not len(mine):
+                    short = table.rest_seen_s[row] - table.rest_since_s[row] < least_s
+                    table.static[row] &= not short
+                    continue
+                spare[mine] = False
+                first = min(table.rest_since_s[row], stays.first_s[mine].min())
+                if not -np.inf < table.elsewhere_s[row] < first:
+                    known = stays.elsewhere_s[mine[0]]
+                    empty = self._views.last_empty_s(place[row], float(first))
+                    table.elsewhere_s[row] = known if -np.inf < known < first else empty
+                table.static[row], table.rest_since_s[row] = 1, first
+        others = stays[spare]
+        for k in np.flatnonzero(np.isneginf(others.elsewhere_s)).tolist():
+            others.elsewhere_s[k] = self._views.last_empty_s(others.position_m[k], float(others.first_s[k]))
+        self._spells.add_ended(others)
 
     def _frame(
         self, stamp_s: Any, position_m: Any, class_id: Any, box: Any, p_real: Any, covariance_m2: Any, appearance: Any

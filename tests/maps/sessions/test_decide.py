@@ -19,7 +19,7 @@ from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.sensing.sightlines import nominal_lines
 from evermap.survival import Exponential, Mixture
 from evermap.survival.hazards import never_leaves
-from evermap.types import UNKNOWN, ChangeKind, FloatArray, MapChange, rows_of
+from evermap.types import UNKNOWN, ChangeKind, FloatArray, MapChange, landmark_id_of, rows_of
 
 from .scenes import assert_consistent, begun, found, next_map
 
@@ -641,3 +641,87 @@ def test_one_in_the_place_of_another_is_one_change_or_none(p: float) -> None:
         assert (one.kind, one.landmark_ids, one.probability) == (ChangeKind.REPLACED, (1, 8), p)
         assert (one.stamp_from_s, one.stamp_to_s, one.n_hits, one.n_misses) == (50.0, 85.0, 5, 7)
         assert one.displacement_m == pytest.approx((2.0, 0.1))
+
+
+def instead_of(
+    new_m: tuple[float, float], texts: tuple[str, str], *, came: float | None = 0.6, witnessed: str | None = None
+) -> list[MapChange]:
+    """What is told of a landmark that was missed at `AT[8]` and of a new one; `came`: the arrival is told, too; and
+    which of them was seen to leave or to arrive.
+    """
+    old, new = map(landmark_id_of, texts)
+    living = begun(found([1, 9, old], [AT[1], AT[9], AT[8]])).living
+    living = replace(living, landmark_texts=tuple(sorted(one for one in texts if not one.isdigit())))
+    entry = next_map(living, found([1, new], [AT[1], new_m], place=[0, -1], first_s=100.0, last_s=101.0))
+    nothing = (np.nan, np.nan)
+    told = [
+        MapChange((old,), ChangeKind.VANISHED, 50.0, 80.0, nothing, 0.0, 0.97, 0, 7),
+        MapChange((9,), ChangeKind.VANISHED, 50.0, 90.0, nothing, 0.0, 0.9, 0, 3),
+    ]
+    if came is not None:
+        told.append(MapChange((new,), ChangeKind.APPEARED, 50.0, 85.0, nothing, 0.0, came, 5, 0))
+    none = np.full(1, np.nan)
+    seen = (
+        Witnessed.nothing() if witnessed is None else Witnessed(np.array([landmark_id_of(witnessed)]), none, none, none)
+    )
+    return list(decide.join_replaced(tuple(told), seen, entry))
+
+
+@pytest.mark.parametrize("came", [0.6, None])
+def test_a_new_landmark_without_identity_where_one_was_missed_is_one_change(came: float | None) -> None:
+    """As probable as that the former left; the arrival follows from it, told by itself or not."""
+    changes = instead_of((5.0, 0.2), ("tree-3@10", "pole-4@100"), came=came)
+    assert [one.kind for one in changes] == [ChangeKind.VANISHED, ChangeKind.REPLACED]
+    both = tuple(map(landmark_id_of, ("tree-3@10", "pole-4@100")))
+    assert changes[0].landmark_ids == (9,)
+    assert (changes[1].landmark_ids, changes[1].probability) == (both, 0.97)
+    assert changes[1].displacement_m == pytest.approx((0.0, 0.2))
+    assert (changes[1].n_hits, changes[1].n_misses) == (0 if came is None else 5, 7)
+    assert (changes[1].stamp_from_s, changes[1].stamp_to_s) == (50.0, 80.0)
+
+
+@pytest.mark.parametrize(
+    ("new_m", "texts"),
+    [
+        ((5.0, 0.4), ("tree-3@10", "pole-4@100")),  # beside it
+        ((5.0, 0.2), ("3", "pole-4@100")),  # a number is an identity
+        ((5.0, 0.2), ("tree-3@10", "dock")),
+    ],
+)
+def test_what_stands_beside_or_has_an_identity_replaces_nothing(
+    new_m: tuple[float, float], texts: tuple[str, str]
+) -> None:
+    kinds = [one.kind for one in instead_of(new_m, texts)]
+    assert kinds == [ChangeKind.VANISHED, ChangeKind.VANISHED, ChangeKind.APPEARED]
+
+
+@pytest.mark.parametrize("witnessed", ["tree-3@10", "pole-4@100"])
+def test_who_was_seen_to_leave_or_to_come_replaces_nothing(witnessed: str) -> None:
+    kinds = [one.kind for one in instead_of((5.0, 0.2), ("tree-3@10", "pole-4@100"), witnessed=witnessed)]
+    assert kinds == [ChangeKind.VANISHED, ChangeKind.VANISHED, ChangeKind.APPEARED]
+
+
+def test_what_came_and_left_in_one_session_was_nowhere_before() -> None:
+    """Of a map's first session nothing is replaced."""
+    texts = ("tree-3@10", "pole-4@10")
+    old, new = map(landmark_id_of, texts)
+    entry = begun(found([old, new], [AT[8], (5.0, 0.1)]))
+    entry = replace(entry, living=replace(entry.living, landmark_texts=tuple(sorted(texts))))
+    told = (MapChange((old,), ChangeKind.VANISHED, 50.0, 80.0, (np.nan, np.nan), 0.0, 0.97, 0, 7),)
+    assert decide.join_replaced(told, Witnessed.nothing(), entry) == told
+
+
+def test_one_replaces_one() -> None:
+    """Of two that were missed beside a new one, the nearer one is replaced."""
+    texts = ("tree-3@10", "tree-4@10", "pole-4@100")
+    one, two, new = map(landmark_id_of, texts)
+    living = begun(found([1, one, two], [AT[1], (5.0, 0.0), (5.0, 0.3)])).living
+    living = replace(living, landmark_texts=tuple(sorted(texts)))
+    entry = next_map(living, found([1, new], [AT[1], (5.0, 0.2)], place=[0, -1], first_s=100.0, last_s=101.0))
+    told = [
+        MapChange((name,), ChangeKind.VANISHED, 50.0, 80.0, (np.nan, np.nan), 0.0, 0.97, 0, 7) for name in (one, two)
+    ]
+    changes = decide.join_replaced(tuple(told), Witnessed.nothing(), entry)
+    assert [(change.kind, change.landmark_ids) for change in changes] == [
+        (ChangeKind.VANISHED, (one,)), (ChangeKind.REPLACED, (two, new)),
+    ]  # fmt: skip

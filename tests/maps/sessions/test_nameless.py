@@ -187,6 +187,27 @@ def test_a_late_session_makes_the_map_of_the_right_order(
     np.testing.assert_array_equal(late.places.position_m, sessions[2].living.places.position_m)
 
 
+def test_another_class_where_one_stood_is_one_change(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    """Never that one vanished and another one appeared, as two facts; what stays is of the other class."""
+    one, sessions = lived
+    before, now = names(one, sessions, 0), names(one, sessions, 1)
+    true = one.truths[1].detection_landmark_id
+    seen = np.bincount(true[true >= 0])
+    given, classes, called = one.sessions[1].detections, one.sessions[1].class_names, sessions[0].living.landmark_names
+    alone = [name for name in before if now.get(name) == before[name] and called[name].startswith("marker")]
+    name = max(alone, key=lambda name: int(seen[before[name]]))  # markers are on no body with others
+    mine, other = true == before[name], classes.index("chair")
+    changed = replace(given, class_id=np.where(mine, other, given.class_id))
+    session = lived_through([replace(one.sessions[1], detections=changed)], NAMELESS, sessions[0].living)[0]
+    told = [change for change in session.changes if name in change.landmark_ids]
+    assert [change.kind for change in told] == [ChangeKind.REPLACED]
+    assert told[0].probability > 0.9
+    after, new = session.living.landmarks(), told[0].landmark_ids[1]
+    assert not any(new in change.landmark_ids for change in session.changes if change is not told[0])
+    row = after.landmark_id.tolist().index(new)
+    assert after.class_names[int(after.class_id[row])] == "chair"
+
+
 def test_localising_frame_by_frame_needs_identities(lived: tuple[BuildingSimulation, list[Session]]) -> None:
     one, sessions = lived
     with pytest.raises(ConfigError, match="not causal"):

@@ -11,6 +11,7 @@ from evermap.geometry.chunked import of_places, taken
 from evermap.maps.diff import COMES, elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
+from evermap.maps.names import is_anonymous
 from evermap.maps.sessions.believe import Believed, Witnessed
 from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
@@ -105,6 +106,53 @@ def with_replaced(
             MapChange((old, new), ChangeKind.REPLACED, last_s, float(what.until_s[k]), shift_m, 0.0, p, hits, misses)
         )
     return replace(after, stays=replace(stays, p_gone=p_gone)), tuple(told)
+
+
+def join_replaced(
+    changes: tuple[MapChange, ...], what: Witnessed, entry: Extended, settings: DecisionConfig = USUAL
+) -> tuple[MapChange, ...]:
+    """Return the changes with departures of landmarks without identity, where a new one stands, as replacements.
+
+    It is another one because class, size or what it is like say so. That the former left and that the new one came is
+    one fact: that there is another one, or that the same was misread, as probable as the departure.
+
+    Args:
+        changes: of a session.
+        what: which were seen to leave or arrive: then both are facts.
+        entry: the map before its beliefs were updated, with the session's landmarks.
+        settings: how close to the former place the new one is.
+    """
+    living, before = entry.living, entry.before
+    nameless = np.array([landmark_id_of(one) for one in living.landmark_texts if is_anonymous(one)], dtype=np.int64)
+    nameless = nameless[~np.isin(nameless, what.landmark_id)]
+    taken = [name for one in changes if one.kind not in COMES for name in one.landmark_ids]
+    new = np.isin(entry.landmark_id, nameless) & ~np.isin(entry.landmark_id, [*before.members.landmark_id, *taken])
+    left = [k for k, one in enumerate(changes) if one.kind is ChangeKind.VANISHED and len(one.landmark_ids) == 1]
+    mine = set(np.intersect1d(nameless, before.members.landmark_id).tolist())
+    left = [k for k in left if changes[k].landmark_ids[0] in mine]
+    if not left or not new.any():
+        return changes
+    names, at_m = entry.landmark_id[new], living.places.position_m[entry.place[new]]
+    old = np.array([changes[k].landmark_ids[0] for k in left])
+    site = before.told_site()[np.searchsorted(before.members.landmark_id, old)]
+    was_m = living.places.position_m[living.place_row(old, site)]
+    away_m = np.linalg.norm(was_m[:, None] - at_m, axis=2)
+    told, joined = list(changes), list[MapChange]()
+    for pair in np.argsort(away_m, axis=None, kind="stable").tolist():
+        k, m = np.unravel_index(pair, away_m.shape)
+        if away_m[k, m] > settings.same_place_m:
+            break
+        away_m[k], away_m[:, m] = np.inf, np.inf
+        went, name = changes[left[k]], int(names[m])
+        came = [one for one in told if one.kind in COMES and one.landmark_ids == (name,)]
+        told = [one for one in told if one is not went and one not in came]
+        shift_m = tuple((at_m[m] - was_m[k]).tolist())
+        hits = sum(one.n_hits for one in came)
+        pair_ids = (*went.landmark_ids, name)
+        joined.append(
+            replace(went, kind=ChangeKind.REPLACED, landmark_ids=pair_ids, displacement_m=shift_m, n_hits=hits)
+        )
+    return (*told, *joined)
 
 
 class _Session:

@@ -314,6 +314,7 @@ def judged(
         entry.before, entry.living, now, seen, came, span_s[0], classes, settings=config.decisions
     )
     after, changes = decide.with_replaced(after, changes, visit.witnessed, entry)
+    changes = decide.join_replaced(changes, visit.witnessed, entry, config.decisions)
     if config.cliques and config.existence and config.misses:
         after = without_missed(entry.before, after, config.grouping)
     after = decide.without_forgotten(after, config.most_sites, config.decisions)

@@ -129,7 +129,7 @@ def _find_rests(
     stamp_s = problem.seen_s
     for one in np.unique(body[body != UNKNOWN]):
         mine = np.flatnonzero(body == one)
-        moves = _find_moving(
+        moves = find_moving(
             stamp_s[mine], at[mine, :2], sigma_m[mine], problem.place[mine], problem.settings.bodies, settings
         )
         part = np.cumsum(np.diff(stamp_s[mine], prepend=-np.inf) > problem.settings.bodies.unseen_s)
@@ -142,7 +142,7 @@ def _find_rests(
     return found
 
 
-def _find_moving(
+def find_moving(
     stamp_s: FloatArray,
     at: FloatArray,
     sigma_m: FloatArray,

@@ -14,7 +14,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from evermap.config import SpaceConfig, StillConfig, TrackConfig, TrafficConfig
+from evermap.config import SpaceConfig, TrackConfig, TrafficConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.intake import most_of
@@ -25,7 +25,7 @@ from evermap.slam.space.result import concluded_in_space, distinguished
 from evermap.slam.space.solve import SpatialSolved, solve_space, times_of
 from evermap.tracking.frame import Poses, box_table, boxes_of, in_world, mounts_of, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
-from evermap.tracking.standing import Stood, long_enough, standing
+from evermap.tracking.standing import Stood, long_enough
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -173,10 +173,6 @@ def conclude_in_traffic(
     """Return poses and static objects, with rows of detections of `taken.recording`; and tracks along these poses."""
     result = concluded_in_space(taken.standing, intake, solved)
     followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.gauge, track)
-    if followed is not None:
-        p_still = _stands(taken.recording, followed, track.still).p_still
-        of_row = [p_still.get(one, np.nan) for one in followed.tracks.track_id.tolist()]
-        followed = replace(followed, p_static=np.array(of_row, dtype=np.float64))
     alone = se3.compose(result.trajectory.pose_world_robot[0], taken.driven)
     return replace(
         result,
@@ -211,7 +207,7 @@ def _settled(
     seen = se3.transform(mount, recording.detections.position_sensor_m[rows])
     for _ in range(ROUNDS):
         followed = _followed(recording, gauge.applied(driven), gauge, track)
-        stands = _stands(recording, followed, track.still)
+        stands = _stands(recording, followed)
         if followed is None:
             break
         # in the first round every track may be static
@@ -237,16 +233,12 @@ def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track
         return None
 
 
-def _stands(recording: SpatialRecording, followed: TrackResult | None, settings: StillConfig) -> Stood:
-    """Return the static boxes."""
-    rows = boxes_of(recording)
-    stamp_s = recording.frames.stamp_s[recording.detections.frame[rows]]
-    if followed is None:
-        nobody = np.full(len(rows), UNKNOWN)
-        return standing(stamp_s, np.zeros((len(rows), 3)), np.ones(len(rows)), nobody, np.ones(len(rows)), settings)
-    limit = followed.speeds_mps()[recording.detections.class_id[rows]]
-    range_m = np.linalg.norm(recording.detections.position_sensor_m[rows], axis=1)
-    return standing(stamp_s, followed.table.position_m, range_m, followed.track_of_detection, limit, settings)
+def _stands(recording: SpatialRecording, followed: TrackResult | None) -> Stood:
+    """Return the static boxes; none where nothing is tracked."""
+    if followed is not None and followed.stood is not None:
+        return followed.stood
+    count, none = len(boxes_of(recording)), np.zeros(0)
+    return Stood(np.full(count, UNKNOWN), np.full(count, np.nan), {}, none.astype(np.int64), none, none, none)
 
 
 def _standing_only(

@@ -1,0 +1,213 @@
+"""Rest by all detections of a recording: what a robot that drives past says of parked boxes, and of who creeps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap.config import TrackConfig
+from evermap.io import write_native
+from evermap.pipeline import run_slam
+from evermap.runs.track.detections import read_input
+from evermap.tracking.frame import DetectionTable
+from evermap.tracking.record import Event, SpellLog, StaticSpells
+from evermap.tracking.run import find_misses, make_tracker, run_track
+from evermap.tracking.standing import Stood, join_stood
+from evermap.tracking.tracker import Tracker
+from evermap.tracking.tracklets import EventKind
+from evermap.tracking.views import View
+from evermap.types import UNKNOWN, FloatArray
+from evermap_studies.worlds.parking import StreetConfig, StreetRun, simulate_street
+
+COLUMNS = ("track_id", "class_id", "position_m", "elsewhere_s", "first_s", "last_s", "gone_s")
+SEEN = TrackConfig(range_m=30.0, fov_deg=110.0)
+PARKED_M = 3.0
+"""Farthest that a spell is from its slot, at the odometry's drift."""
+
+
+@pytest.fixture(scope="module")
+def days() -> StreetRun:
+    """Two days on a street on which cars and vans park and leave."""
+    return simulate_street(StreetConfig(days=2), 5)
+
+
+@pytest.fixture(scope="module")
+def tables(days: StreetRun, tmp_path_factory: pytest.TempPathFactory) -> list[DetectionTable]:
+    """Each day as `evermap track` reads it."""
+    root = tmp_path_factory.mktemp("street")
+    found = []
+    for k, drive in enumerate(days.drives):
+        write_native(drive, root / str(k))
+        found.append(read_input(root / str(k)))
+    return found
+
+
+def joined(tables: list[DetectionTable]) -> DetectionTable:
+    """Return one table of successive ones."""
+    first = [np.zeros(1, dtype=np.int64)]
+    for table in tables:
+        first.append(first[-1][-1] + table.first[1:])
+    names = ("stamp_s", "position_m", "class_id", "box", "score", "sensor_m", "sensor_yaw_rad", "line")
+    columns: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
+    return replace(tables[0], first=np.concatenate(first), **columns)
+
+
+def test_track_finds_what_slam_finds(days: StreetRun, tables: list[DetectionTable]) -> None:
+    """A car is in view for two to five seconds: the same objects, the same spells, and all that stand on the street."""
+    for drive, table in zip(days.drives, tables, strict=True):
+        ours, theirs = run_track(table, TrackConfig()), run_slam(drive)
+        assert theirs.followed is not None
+        other = theirs.followed.spells
+        assert len(ours.spells) == len(other) == len(theirs.landmarks) > 20
+        np.testing.assert_array_equal(np.sort(ours.spells.track_id), np.sort(theirs.landmarks.landmark_id.astype(int)))
+        np.testing.assert_allclose(ours.spells.first_s, other.first_s, atol=0.31)
+        np.testing.assert_allclose(ours.spells.last_s, other.last_s, atol=0.31)
+        at_s = float(table.stamp_s[0]) + 20.0
+        assert abs(len(days.street.standing(at_s) & days.street.find_passed()) - len(ours.spells)) <= 2
+
+
+def test_two_days_by_a_saved_state_are_two_days_in_one_table(tables: list[DetectionTable], tmp_path: Path) -> None:
+    """Also of those that were seen for too short to enter the tracker's own spells, and had left the next day."""
+    whole = run_track(joined(tables), SEEN).spells
+    for k, table in enumerate(tables):
+        tracker = make_tracker(table, SEEN, state=tmp_path / "state" if k else None)
+        spells = run_track(table, SEEN, tracker=tracker).spells
+        tracker.save(tmp_path / "state")
+    assert np.isfinite(whole.gone_s).sum() >= 5
+    for name in ("track_id", "class_id", "elsewhere_s", "first_s", "last_s", "gone_s"):
+        np.testing.assert_array_equal(getattr(spells, name), getattr(whole, name), err_msg=name)
+    np.testing.assert_allclose(spells.position_m, whole.position_m, atol=1e-6)  # the working set is of float32
+
+
+def box_track(speed_mps: float, frames: int, *, then: int = 0) -> StaticSpells:
+    """A box at ten frames a second from 5 s on, where nothing was for 5 s, and nothing for some frames thereafter."""
+    here = View.ball(np.zeros(3), 20.0, 0.9)
+    stamps: FloatArray = np.arange(50 + frames + then) / 10.0
+    seen = (np.arange(len(stamps)) >= 50) & (np.arange(len(stamps)) < 50 + frames)
+    rng = np.random.default_rng(0)
+    n = int(seen.sum())
+    position = np.column_stack([5.0 + speed_mps * 0.1 * np.arange(n), np.zeros(n), np.full(n, 0.75)])
+    position += rng.normal(0.0, 0.05, position.shape)
+    table = DetectionTable(
+        source="made", class_names=("",), stamp_s=stamps, first=np.append(0, np.cumsum(seen)),
+        position_m=position, class_id=np.zeros(n, dtype=np.int64), covariance_m2=None, appearance=None,
+        sensor_m=np.tile(here.centre_m, (len(stamps), 1)), line=np.arange(n) + 2,
+        box=np.tile([4.2, 1.7, 1.5, 0.0], (n, 1)),
+    )  # fmt: skip
+    return run_track(table, TrackConfig(range_m=20.0)).spells
+
+
+def test_a_parked_box_needs_no_four_seconds() -> None:
+    spells = box_track(0.0, 15)
+    assert len(spells) == 1
+    assert (spells.first_s[0], spells.last_s[0]) == (pytest.approx(5.0), pytest.approx(6.4))
+    assert 4.0 < spells.elsewhere_s[0] < 5.0
+    assert spells.gone_s[0] == np.inf
+
+
+def test_one_that_leaves_its_place_while_it_is_watched_is_missed_there() -> None:
+    spells = box_track(0.0, 60, then=40)
+    assert len(spells) == 1
+    assert 10.8 < spells.last_s[0] < spells.gone_s[0] < 12.5
+
+
+def test_who_creeps_does_not_rest() -> None:
+    """Its speed is above that of its class, though the first seconds do not show it."""
+    assert len(box_track(1.5, 60)) == 0
+
+
+def test_what_the_tracker_took_for_rest_is_forgotten_unless_it_was_long() -> None:
+    """Of this recording; what earlier ones say stays."""
+    tracker = Tracker(boxes=True)
+    for k in range(45):
+        tracker.step(0.1 * k, np.zeros((1, 3)), box=np.ones((1, 4)))
+    assert len(tracker.static_spells()) == 1  # from 2 s on
+    nothing = tracker.static_spells()[np.zeros(0, dtype=np.int64)]
+    tracker.confirm_rest(nothing, 10.0)
+    assert len(tracker.static_spells()) == 1
+    short = Tracker(boxes=True)
+    for k in range(35):
+        short.step(0.1 * k, np.zeros((1, 3)), box=np.ones((1, 4)))
+    assert len(short.static_spells()) == 1
+    short.confirm_rest(nothing, 0.0)
+    assert len(short.static_spells()) == 0
+    tracker.confirm_rest(nothing, 0.0)
+    assert len(tracker.static_spells()) == 1  # 2.4 s
+
+
+def spells_of(*rows: tuple[int, float, float, float, float]) -> StaticSpells:
+    """Spells by track, elsewhere, first, last, gone."""
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+    whole = columns[0].astype(np.int64)
+    return StaticSpells(whole, np.zeros_like(whole), np.zeros((len(whole), 3)), *columns[1:])
+
+
+def test_ended_spells_begin_with_the_stay_and_short_ones_need_one() -> None:
+    log = SpellLog()
+    earlier = (0, -np.inf, 1.0, 1.5, 3.0)
+    crept, confirmed = (1, -np.inf, 11.0, 12.0, 15.0), (2, 9.0, 12.0, 13.0, 15.0)
+    long, arrived = (3, -np.inf, 11.0, 14.0, 15.0), (4, 11.5, 12.0, 13.0, 15.0)
+    log.restore({name: getattr(spells_of(earlier, crept, confirmed, long, arrived), name) for name in COLUMNS})
+    stays = spells_of(
+        (2, -np.inf, 10.0, 13.0, np.inf), (4, -np.inf, 11.0, 13.0, np.inf), (5, -np.inf, 11.0, 13.0, np.inf)
+    )
+    assert log.confirm(stays, 10.0, 2.0).tolist() == [True, True, False]
+    kept = log.columns()
+    assert kept["track_id"].tolist() == [0, 2, 3, 4]
+    assert kept["first_s"].tolist() == [1.0, 10.0, 11.0, 12.0]  # 4 was elsewhere later than the stay begins
+
+
+def test_stays_of_who_is_neither_followed_nor_stored_have_ended() -> None:
+    tracker = Tracker(boxes=True)
+    tracker.step(0.0, np.zeros((1, 3)), box=np.ones((1, 4)))
+    stay = spells_of((77, -np.inf, 3.0, 4.0, 9.0))
+    tracker.confirm_rest(stay, 0.0)
+    found = tracker.static_spells()
+    assert (found.track_id.tolist(), found.first_s.tolist(), found.gone_s.tolist()) == ([77], [3.0], [9.0])
+
+
+def test_rest_that_is_confirmed_begins_with_the_stay_and_earlier_days_are_not_asked() -> None:
+    tracker = Tracker(boxes=True)
+    for k in range(35):
+        tracker.step(100.0 + 0.1 * k, np.zeros((1, 3)), box=np.ones((1, 4)))
+    nothing = spells_of()
+    tracker.confirm_rest(nothing, 200.0)
+    before = tracker.static_spells()
+    assert before.first_s.tolist() == [pytest.approx(102.0)]
+    name = int(before.track_id[0])
+    tracker.confirm_rest(spells_of((name, 99.7, 100.1, 103.4, np.inf)), 100.0)
+    after = tracker.static_spells()
+    assert (after.elsewhere_s.tolist(), after.first_s.tolist()) == ([99.7], [100.1])
+    assert (after.last_s[0], after.gone_s[0]) == (before.last_s[0], np.inf)
+
+
+def test_misses_are_of_those_that_were_stored_last() -> None:
+    told = [
+        (1, EventKind.STORED, 5.0), (1, EventKind.DIED, 9.0), (2, EventKind.DIED, 9.0), (3, EventKind.STORED, 5.0),
+        (3, EventKind.REIDENTIFIED, 6.0), (3, EventKind.DIED, 9.0), (4, EventKind.STORED, 5.0),
+    ]  # fmt: skip
+    events = [Event(stamp_s, kind, name) for name, kind, stamp_s in told]
+    np.testing.assert_array_equal(find_misses(events, np.arange(1, 5)), [9.0, np.inf, np.inf, np.inf])
+
+
+@pytest.mark.parametrize(("off_m", "left_s", "stays"), [(0.2, np.nan, 1), (0.8, np.nan, 2), (0.2, 3.0, 2)])
+def test_a_track_that_stands_where_it_stood_goes_on_after_a_gap(off_m: float, left_s: float, stays: int) -> None:
+    """Unless it was seen to leave; one that moves in a part is as little still as it is there."""
+
+    def part(track: int, until_s: float, p: float) -> Stood:
+        stay, unseen = np.array([UNKNOWN, 0, 0]), np.array([np.nan])
+        return Stood(stay, np.full(3, p), {track: p}, np.array([track]), np.array([p]), unseen, np.array([until_s]))
+
+    parts = [part(7, left_s, 0.95), part(7, np.nan, 0.99)]
+    position_m = np.zeros((6, 3))
+    position_m[3:, 0] = off_m
+    joined = join_stood(parts, position_m, TrackConfig().still)
+    assert joined.stay.tolist() == [UNKNOWN, 0, 0, UNKNOWN, *[stays - 1] * 2]
+    assert joined.track.tolist() == [7] * stays
+    assert joined.p_still == {7: 0.95}
+    assert joined.p_stay.tolist() == ([0.99] if stays == 1 else [0.95, 0.99])
+    np.testing.assert_array_equal(joined.until_s, [np.nan] if stays == 1 else [left_s, np.nan])
