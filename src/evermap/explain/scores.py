@@ -153,6 +153,8 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
     at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
     usual = list[tuple[Column, float, FloatArray]]()
     for suspect in sorted(_list_calibrations(inputs), key=lambda one: one.code not in USUAL):
+        if _is_estimated(session, inputs, suspect):
+            continue
         if suspect.code in OF_MOTION:
             direction = change_by_motion(session, screen, inputs, suspect)
         else:
@@ -182,6 +184,15 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         if gain > CHANCE:
             gain /= max(screen.variance(column, value) / column.information_with(column), 1.0)
         yield CalibrationScore(suspect, value, known**-0.5, gain, shift / sigma_m)
+
+
+def _is_estimated(session: AnySession, inputs: Inputs, suspect: Suspect) -> bool:
+    """Return whether a clock in space is a state of the solution; asked again it would but relieve its prior."""
+    if suspect.code != "clock" or isinstance(session, Solved):
+        return False
+    sigma_s = session.solved.optimum.smoother.problem.delay_sigma_s
+    names = [one.name for one in inputs.recording.sensors]
+    return bool(sigma_s[names.index(suspect.subject)] > 0.0 if suspect.subject in names else np.any(sigma_s > 0.0))
 
 
 def _went_by_clock(session: AnySession, suspect: Suspect, dim: int) -> FloatArray:
