@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from evermap import read_recording, run_slam
+from evermap.config import Config
 from evermap.geometry import se3
 from evermap.io.native_write import write_native
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space.intake import prepare_space, start_noise
+from evermap.slam.space.starts import by_constellations
 from evermap.types import UNKNOWN, Measurements, SlamResult, SpatialRecording, rows_of
 
 from .halls import hall
@@ -159,6 +162,19 @@ def test_landmarks_that_are_only_measured_are_mapped_without_odometry(kind):
     there = se3.transform(se3.inverse(true[first]), beacon)
     numbers = 2 if kind == "ranges" else 3  # by ranges from a floor it may be below as well
     assert np.linalg.norm((found.position_m[ours] - there)[:, :numbers], axis=1).max() < 0.5
+
+
+def test_starts_from_constellations_know_what_is_only_measured():
+    """A place that stood at the origin would draw every start there."""
+    recording, beacon = hall(3, n_points=40, n_frames=150, drift=0.05), np.array([[12.0, 8.0, 3.0]])
+    way, stamp_s = recording.truth, recording.frames.stamp_s
+    true = se3.interpolate(way.stamp_s, way.pose_world_robot, stamp_s)
+    far = np.linalg.norm(se3.transform(true, np.zeros(3)) - beacon, axis=1)
+    table = Measurements("ranges", stamp_s, {"range_m": far}, np.full(len(far), 100))
+    problem = prepare_space(replace(recording, odometry=None, measurements=(table,)), Config().slam.space).problem
+    (begun,) = by_constellations(problem, start_noise(problem.settings, driven=False), 1)
+    apart = np.linalg.norm(begun.pose[:, :3] - begun.place[-1, :3], axis=1)
+    assert np.median(np.abs(apart - far)) < 0.1 * np.median(far)
 
 
 def test_tables_of_measurements_are_written_and_read_back(tmp_path):
