@@ -55,6 +55,7 @@ KINDS: dict[str, Kind] = {
     "cpu_s": Kind("cost", "lower", 0.25, 0.3),
     "frame_ms": Kind("cost", "lower", 0.5, 5.0),
     "over_peer": Kind("cost", "lower", 0.25, 0.1),
+    "over_iteration": Kind("cost", "lower", 0.25, 1.0),
     "factorisations": Kind("cost", "lower", 0.03),
     "count": Kind("cost", "lower", 0.03),
 }  # fmt: skip

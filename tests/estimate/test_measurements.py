@@ -176,3 +176,12 @@ def test_ranges_from_a_line_locate_nothing_and_from_a_floor_what_is_above_it():
     bend[:, 1] = 0.3 * along**2
     far = np.linalg.norm(place - bend[:, :3], axis=1)
     assert kind.place(bend, {**columns_of(kind, 15), "range_m": far}) == pytest.approx(place, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["bearings", "ranges"])
+def test_a_landmark_overhead_or_where_the_robot_is_has_finite_derivatives(name):
+    kind, pose = find_kinds()[name], se3.identity(2)
+    columns = columns_of(kind, 2, **MEASURED[name])
+    found = kind.linearise(pose, np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]), columns)
+    for part in (found.residual[:, :1], found.by_pose, found.by_other):
+        assert np.isfinite(part).all()

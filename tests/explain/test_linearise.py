@@ -12,7 +12,7 @@ from evermap.config import Config
 from evermap.estimate.sparse.system import exhausted
 from evermap.explain.causes import Inputs, list_suspects
 from evermap.explain.evidence import Screen, optimum_of, residuals_of
-from evermap.explain.linearise import STEP, change_by
+from evermap.explain.linearise import FINE_STEP, STEP, change_by, change_by_motion
 from evermap.maps.sessions import session
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import prepare
@@ -73,3 +73,22 @@ def test_a_lens_changes_residuals_as_if_all_were_read_again() -> None:
         assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max(), suspect.subject
         asked += 1
     assert asked > 0
+
+
+def test_noise_of_the_same_size_at_all_ranges_does_not_shrink_them() -> None:
+    """Shorter ranges have shorter errors: were their noise to stay, all lengths together would seem too long."""
+    recording = World(seed=3).space(corners=False)
+    seen = recording.detections
+    unstated = replace(seen, covariance_sensor_m2=np.full((len(seen), 3, 3), np.nan))
+    sensors = tuple(replace(one, sigma_m=0.03) for one in recording.sensors)
+    recording = replace(recording, detections=unstated, sensors=sensors)
+    visit, _, inputs = session.explained(Inputs.of(recording, None), CONFIG, ())
+    solved = session.solution_of(visit)
+    screen = Screen.of(optimum_of(solved))
+    suspects = {one.code: one for one in list_suspects(inputs, calibrations=True)}
+    ranges = change_by(solved, screen, inputs, suspects["range-scale"], FINE_STEP)
+    driven = change_by_motion(solved, screen, inputs, suspects["odometry-scale"])
+    assert ranges is not None
+    assert driven is not None
+    lengths = screen.column(ranges + driven)  # of which mounts alone have the metre
+    assert abs(screen.pull(lengths)) < 3.0 * lengths.information_with(lengths) ** 0.5

@@ -106,6 +106,19 @@ def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
     assert suspected.shift > 0.5
 
 
+@pytest.mark.parametrize("late_s", [0.2, pytest.param(-0.2, marks=pytest.mark.slow)])
+def test_a_delay_that_was_estimated_is_not_held(late_s: float) -> None:
+    """Its prior pulls it to 0, and a clock that is asked beside it would relieve that."""
+    recording = World(seed=1, late_s=late_s).space()
+    one = replace(recording, sensors=recording.sensors[:1])
+    seen = recording.detections.sensor == 0
+    one = replace(one, detections=recording.detections[np.flatnonzero(seen)])
+    found = scored(one, None)
+    assert found.calibrations
+    assert "clock" not in {each.suspect.code for each in found.calibrations}
+    assert found.suspected is None
+
+
 def test_scores_of_true_calibrations_are_standard_normal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if noise of the odometry is as large as its motions, and turns the robot about one of three axes only."""
     monkeypatch.setattr(scores, "CHANCE", 0.0)

@@ -21,7 +21,7 @@ from evermap.io import read_recording
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.orientations import without_unmeasured
 from evermap.slam.plane import in_its_space
-from evermap.types import Recording, SlamResult, SpatialRecording
+from evermap.types import UNKNOWN, Measurements, Recording, SlamResult, SpatialRecording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
@@ -105,6 +105,15 @@ def test_orientations_that_nobody_measured_are_left_out_with_one_line(tmp_path: 
         assert without_unmeasured(honest, DEFAULT.check) is honest
 
 
+def with_floor(recording: SpatialRecording, **columns: np.ndarray) -> SpatialRecording:
+    """Return a recording with heights, and tilts, that were measured beside, once a second; a few are wrong."""
+    count = len(columns["z_m"])
+    stamp_s = recording.frames.stamp_s[0] + np.arange(count)
+    columns["z_m"] = columns["z_m"] + np.where(np.arange(count) % 30 == 7, 3.0, 0.0)
+    table = Measurements("floor", stamp_s, columns, np.full(count, UNKNOWN))
+    return replace(recording, measurements=(table,))
+
+
 def test_only_a_robot_on_a_floor_is_in_the_plane(tmp_path: Path) -> None:
     recording = bag(tmp_path)
     odometry = recording.odometry
@@ -112,6 +121,11 @@ def test_only_a_robot_on_a_floor_is_in_the_plane(tmp_path: Path) -> None:
     assert isinstance(in_its_space(recording, DEFAULT), Recording)
     assert isinstance(in_its_space(recording, DEFAULT, dim=3), SpatialRecording)
     assert isinstance(in_its_space(recording, Config(slam={"plane": False}).slam), SpatialRecording)
+    beside = {"z_m": 0.7 + 0.01 * np.sin(np.arange(60.0))}
+    assert isinstance(in_its_space(with_floor(recording, **beside), DEFAULT), Recording)
+    for ramp in (beside["z_m"] + 0.01 * np.arange(60.0), np.full(60, 0.7)):
+        leaning = {"up_x": 0.1 * np.sin(0.2 * np.arange(60.0))} if np.ptp(ramp) == 0.0 else {}
+        assert isinstance(in_its_space(with_floor(recording, z_m=ramp, **leaning), DEFAULT), SpatialRecording)
     sway = 0.05 * np.sin(np.arange(len(odometry)))
     climbs = odometry.pose_world_robot + 0.01 * np.arange(len(odometry))[:, None] * np.eye(7)[2]
     rolls = se3.compose(odometry.pose_world_robot, se3.exp(sway[:, None] * np.eye(6)[3]))

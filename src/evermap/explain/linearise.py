@@ -220,7 +220,10 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
         intake = replace(intake, problem=intake.problem.seeing(kept), used=intake.used[kept])
     if not (np.array_equal(intake.used, before.used) and len(intake.pose_frame) == len(before.pose_frame)):
         return None
-    return replace(_with_measurements(problem, intake), prior=prior)
+    found = _with_measurements(problem, intake)
+    longer = np.exp((undone.stretched - inputs.stretched)[before.used] / 3.0)
+    root = np.where((longer != 1.0)[:, None, None], problem.measured_root / longer[:, None, None], found.measured_root)
+    return replace(found, measured_root=root, prior=prior)  # noise goes with what is stretched, stated or usual
 
 
 def cost_nearby(session: AnySession) -> float:

@@ -19,6 +19,7 @@ import numpy as np
 
 from evermap.config import CheckConfig, SlamConfig
 from evermap.errors import ConfigError
+from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se2, se3
 from evermap.slam.mistakes import sighting_pairs, unusable
 from evermap.slam.orientations import find_convention, without_unmeasured
@@ -45,6 +46,9 @@ LEVEL_RAD = 0.01
 """Roll and pitch of the odometry of a robot on a floor."""
 HEIGHT_SHARE = 0.1
 """Difference between two heights of one landmark, as a share of its range, that a mount or a ramp must explain."""
+MOST_OF_HEIGHTS, NOISE_OF_HEIGHTS = (0.05, 0.95), 4.0
+"""Quantiles between which measured heights and tilts differ on a ramp, by more than so many standard deviations (of
+Gaussian noise they are 3.3 apart): some may be wrong."""
 FEWEST_LANDMARKS = 3
 """Landmarks whose heights must be known to show a floor."""
 OVERHEAD = 0.1
@@ -127,12 +131,34 @@ def is_on_floor(recording: SpatialRecording, settings: CheckConfig) -> bool:
         return False
     if np.ptp(odometry.pose_world_robot, axis=0).max() < 1e-9:  # stands still, or nobody measured its motion
         return False
+    if not _is_level_by_measurements(recording):
+        return False
     height, range_m = _on_floor(recording)[:, 2], np.linalg.norm(positions_of(recording), axis=1)
     first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest or len(np.unique(recording.detections.landmark_id[first])) < FEWEST_LANDMARKS:
         return False
     apart = np.abs(height[first] - height[second]) / np.maximum(range_m[first], range_m[second])
     return bool(np.median(apart) < HEIGHT_SHARE)
+
+
+def _is_level_by_measurements(recording: SpatialRecording) -> bool:
+    """Return whether heights and tilts that were measured beside (kind `floor`) are constant, to within their noise.
+
+    Wheels tell neither: their odometry is as level on a ramp as on a floor.
+    """
+    for table in recording.measurements:
+        if table.kind != "floor":
+            continue
+        columns = {name: np.full(len(table), value) for name, value in find_kinds()["floor"].optional.items()}
+        columns |= table.columns
+        for name, sigma, least in (
+            ("z_m", "sigma_z_m", LEVEL_M),
+            *((f"up_{axis}", "sigma_tilt", LEVEL_RAD) for axis in "xy"),
+        ):
+            low, high = np.nanquantile(columns[name], MOST_OF_HEIGHTS)
+            if high - low > least + NOISE_OF_HEIGHTS * np.nanmedian(columns[sigma]):
+                return False
+    return True
 
 
 def is_level(pose: FloatArray) -> bool:

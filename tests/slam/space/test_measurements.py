@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from evermap import read_recording, run_slam
+from evermap.config import Config
 from evermap.geometry import se3
 from evermap.io.native_write import write_native
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space.intake import prepare_space, start_noise
+from evermap.slam.space.starts import by_constellations
 from evermap.types import UNKNOWN, Measurements, SlamResult, SpatialRecording, rows_of
 
 from .halls import hall
@@ -111,11 +114,13 @@ def test_tilt_and_height_are_held(kind):
         assert np.sqrt(np.mean(height**2)) < 0.025
 
 
-@pytest.mark.parametrize("kind", ["ranges", "bearings"])
-def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind):
+@pytest.mark.parametrize(("kind", "begin_s"), [("ranges", 0.3), ("bearings", 0.3), ("bearings", None)])
+def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind, begin_s):
+    """Also from the first pose on, at the origin, where a place that nobody located would be in no direction."""
+    begin_s = float(drive().frames.stamp_s[0]) if begin_s is None else begin_s
     random = np.random.default_rng(4)
     beacon = np.array([[1.0, 1.0, 2.5], [22.0, 2.0, 2.8], [20.0, 15.0, 0.4], [3.0, 14.0, 2.2], [12.0, 8.0, 3.0]])
-    stamp_s = np.repeat(np.arange(0.3, 175.6, 1.0), len(beacon))
+    stamp_s = np.repeat(np.arange(begin_s, 175.6, 1.0), len(beacon))
     which = np.tile(np.arange(len(beacon)), len(stamp_s) // len(beacon))
     seen = se3.transform(se3.inverse(true_pose(stamp_s)), beacon[which])
     if kind == "ranges":
@@ -130,6 +135,46 @@ def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind):
     assert set(100 + np.arange(len(beacon))) <= set(result.landmarks.landmark_id.tolist())
     hits = result.landmarks.n_hits[np.isin(result.landmarks.landmark_id, 100 + which)]
     assert np.all(hits == len(stamp_s) // len(beacon))
+
+
+@pytest.mark.parametrize("kind", ["ranges", "bearings"])
+def test_landmarks_that_are_only_measured_are_mapped_without_odometry(kind):
+    """Points are begun from constellations; from the origin ranges would draw the drive elsewhere."""
+    random, recording = np.random.default_rng(4), hall(3, n_points=40, n_frames=150, drift=0.05)
+    beacon = np.array([[1.0, 1.0, 2.5], [22.0, 2.0, 2.8], [20.0, 15.0, 2.4], [3.0, 14.0, 2.2]])
+    stamp_s = np.repeat(recording.frames.stamp_s, len(beacon))
+    which = np.tile(np.arange(len(beacon)), len(recording.frames))
+    way, frame_s = recording.truth, recording.frames.stamp_s
+    true = se3.interpolate(way.stamp_s, way.pose_world_robot, frame_s)
+    seen = se3.transform(se3.inverse(np.repeat(true, len(beacon), axis=0)), beacon[which])
+    columns = {"range_m": np.linalg.norm(seen, axis=1) + random.normal(0.0, 0.05, len(seen))}
+    if kind == "bearings":
+        columns = {
+            "azimuth_rad": np.arctan2(seen[:, 1], seen[:, 0]) + random.normal(0.0, 0.01, len(seen)),
+            "elevation_rad": np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])),
+        }
+    table = Measurements(kind, stamp_s, columns, 100 + which)
+    result = run_slam(replace(recording, odometry=None, measurements=(table,)))
+    found = result.landmarks
+    ours = np.searchsorted(found.landmark_id, 100 + np.arange(len(beacon)))
+    assert found.landmark_id[ours].tolist() == [100, 101, 102, 103]
+    first = np.flatnonzero(frame_s == result.trajectory.stamp_s[0])
+    there = se3.transform(se3.inverse(true[first]), beacon)
+    numbers = 2 if kind == "ranges" else 3  # by ranges from a floor it may be below as well
+    assert np.linalg.norm((found.position_m[ours] - there)[:, :numbers], axis=1).max() < 0.5
+
+
+def test_starts_from_constellations_know_what_is_only_measured():
+    """A place that stood at the origin would draw every start there."""
+    recording, beacon = hall(3, n_points=40, n_frames=150, drift=0.05), np.array([[12.0, 8.0, 3.0]])
+    way, stamp_s = recording.truth, recording.frames.stamp_s
+    true = se3.interpolate(way.stamp_s, way.pose_world_robot, stamp_s)
+    far = np.linalg.norm(se3.transform(true, np.zeros(3)) - beacon, axis=1)
+    table = Measurements("ranges", stamp_s, {"range_m": far}, np.full(len(far), 100))
+    problem = prepare_space(replace(recording, odometry=None, measurements=(table,)), Config().slam.space).problem
+    (begun,) = by_constellations(problem, start_noise(problem.settings, driven=False), 1)
+    apart = np.linalg.norm(begun.pose[:, :3] - begun.place[-1, :3], axis=1)
+    assert np.median(np.abs(apart - far)) < 0.1 * np.median(far)
 
 
 def test_tables_of_measurements_are_written_and_read_back(tmp_path):

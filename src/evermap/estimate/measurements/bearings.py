@@ -14,7 +14,8 @@ def linearise(pose: FloatArray, place: FloatArray, columns: Columns) -> Linearis
     turn = se3.rotation_of(pose)
     seen = se3.transform(se3.inverse(pose), place)
     x, y, z = seen.T
-    flat, far = np.hypot(x, y), np.linalg.norm(seen, axis=1)
+    flat = np.maximum(np.hypot(x, y), 1e-6)
+    far = np.maximum(np.linalg.norm(seen, axis=1), 1e-6)
     off = stacked(columns, "azimuth_rad", "elevation_rad") - np.column_stack([np.arctan2(y, x), np.arctan2(z, flat)])
     by_seen = np.stack(
         [

@@ -25,7 +25,7 @@ from evermap.slam.space.linearise import (
 )
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.types import FloatArray
+from evermap.types import BoolArray, FloatArray
 
 ROUNDS = 12
 """Optimum and noise levels in turns, at most."""
@@ -220,8 +220,20 @@ def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
         away = np.linalg.norm(at[mine, :3] - np.median(at[mine, :3], axis=0), axis=1)
         place[row] = at[mine[int(np.argmin(away))]]
     place[~problem.oriented, 3:] = se3.NO_TURN
-    unseen = np.setdiff1d(np.arange(len(place)), problem.place)
+    return locate_unseen(problem, replace(estimate, place=place))
+
+
+def locate_unseen(
+    problem: SpatialProblem, estimate: SpatialEstimate, known: BoolArray | None = None
+) -> SpatialEstimate:
+    """Return values with places that no detection sees where further measurements have them along its poses.
+
+    Those `known` (P,) stay. At the origin, where a place is that nobody located, a direction or range has no slope.
+    """
+    unseen = np.setdiff1d(np.arange(len(estimate.place)), problem.place)
+    unseen = unseen if known is None else unseen[~known[unseen]]
+    place = estimate.place.copy()
     for tied in problem.measurements:
-        for row, at in tied.locate(pose, unseen).items():
+        for row, at in tied.locate(estimate.pose, unseen).items():
             place[row, :3] = at
     return replace(estimate, place=place)

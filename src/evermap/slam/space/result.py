@@ -191,8 +191,10 @@ def located(problem: SpatialProblem, now: SpatialLinear) -> tuple[BoolArray, Boo
         return np.ones(n, dtype=np.bool_), np.ones(count, dtype=np.bool_)
     good = now.weight > problem.settings.inlier
     soon = np.flatnonzero(np.diff(problem.stamp_s) <= problem.settings.tied_s)
-    one = np.concatenate([problem.pose_row[good], soon])
-    other = np.concatenate([n + problem.place[good], soon + 1])
+    two = [tied for tied in problem.measurements if tied.kind.ties != "pose"]
+    one = np.concatenate([problem.pose_row[good], soon, *(tied.row for tied in two)])
+    others = (tied.other + (n if tied.kind.ties == "pose_place" else 0) for tied in two)
+    other = np.concatenate([n + problem.place[good], soon + 1, *others])
     graph = csr_array((np.ones(len(one)), (one, other)), shape=(n + count, n + count))
     part = connected_components(graph, directed=False)[1]
     stands = problem.prior.place[problem.prior.weight > problem.settings.inlier]

@@ -27,7 +27,14 @@ from evermap.slam.space.against_map import MapComparison, has_contradictions
 from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrust_bodies, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
-from evermap.slam.space.estimate import SpatialOptimum, converged, correlation, first_places, oriented
+from evermap.slam.space.estimate import (
+    SpatialOptimum,
+    converged,
+    correlation,
+    first_places,
+    locate_unseen,
+    oriented,
+)
 from evermap.slam.space.explanation import explain_places
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
@@ -132,6 +139,7 @@ def solve_space(
     scale_in_map = intake.scale_in_map if len(stated) and problem.scale_sigma == 0.0 else 0.0
     problem, noise, drift, counted = _with_drift(problem, noise, intake.driven_pose, in_map=scale_in_map > 0.0)
     stepwise, unsure_s, step_s = incremental(problem, noise, known, place, progress)
+    stepwise = locate_unseen(problem, stepwise, known)
     frames = intake.frames
     online = frames.lead_on(stepwise.pose), _rough_spread(frames.since(unsure_s), noise), frames.share_out(step_s)
     estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)

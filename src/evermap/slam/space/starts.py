@@ -18,6 +18,7 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
 from evermap.geometry.rigid import rigid
+from evermap.slam.space.estimate import locate_unseen
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -341,7 +342,9 @@ def _grown(problem: SpatialProblem, noise: SpatialNoise, seed: int | None) -> Sp
         back = se3.inverse(pose[0])
         pose, place = se3.compose(back, pose), se3.compose(back, place)
     place[~problem.oriented, 3:] = se3.NO_TURN
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES)))
+    known = np.zeros(len(place), dtype=np.bool_)
+    known[problem.prior.place] = True
+    return locate_unseen(problem, SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES))), known)
 
 
 def located_again(
