@@ -611,7 +611,8 @@ def pairings_of_frame(
     joint *= unit[:, None] * unit
     # area element r dr db
     new = np.log(np.where(followed, settings.unmet_share, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
-    return Pairings(source, target, frame.residual[inside] * sigma[seen], joint, new, len(detections)), followed
+    least = 2.0 * np.log(sigma[seen]).sum(axis=1)
+    return Pairings(source, target, frame.residual[inside] * sigma[seen], joint, new, len(detections), least), followed
 
 
 LEAST_LEFT = 0.1

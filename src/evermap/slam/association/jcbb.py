@@ -22,10 +22,15 @@ from scipy.special import gammaincinv
 from evermap.slam.kernels import kernel
 from evermap.types import FloatArray, IntArray
 
-NEGLIGIBLE = 25.0
-"""Log weight below the best set [nats] from which a set is ignored: rounding is larger than its weight."""
-MAX_NODES = 200_000
+NEGLIGIBLE = 12.0
+"""Log weight below the best set [nats] from which a set is ignored: all such sets together weigh about 1e-4."""
+MAX_NODES = 50_000
 """Maximum number of visited nodes, behind which the search is cut; a tenth of a second."""
+NARROWER = 0.5
+"""Share of `NEGLIGIBLE` with which a search that was cut is done again: what is left out is then what weighs least, not
+what comes last in the tree."""
+NARROWEST = 1.0
+"""Log weight [nats] from which a search that was cut is taken as it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +71,11 @@ def most_pairings(pairings: Pairings, *, confidence: float = 0.99) -> IntArray:
     Returns:
         (n_sources,) the row of `Pairings` of every source, -1 for none.
     """
-    return np.asarray(_search(*_arguments(pairings, confidence), False)[0])
+    order, ordered = _ordered(pairings)
+    found = _search(*_arguments(ordered, confidence), False, NEGLIGIBLE)[0]
+    chosen, rows = np.full(pairings.n_sources, -1), order[found[found >= 0]]
+    chosen[pairings.source[rows]] = rows
+    return chosen
 
 
 def pairing_probability(pairings: Pairings, *, confidence: float = 0.99) -> tuple[FloatArray, float]:
@@ -75,8 +84,40 @@ def pairing_probability(pairings: Pairings, *, confidence: float = 0.99) -> tupl
     Returns:
         These, and the evidence of all sets together over only new sources [nats].
     """
-    _, probability, evidence = _search(*_arguments(pairings, confidence), True)
+    order, ordered = _ordered(pairings)
+    arguments, ignored = _arguments(ordered, confidence), NEGLIGIBLE
+    _, found, evidence, is_cut = _search(*arguments, True, ignored)
+    while is_cut and ignored > NARROWEST:
+        ignored *= NARROWER
+        _, found, evidence, is_cut = _search(*arguments, True, ignored)
+    probability = np.zeros(len(order))
+    probability[order] = found
     return probability, evidence
+
+
+def _ordered(pairings: Pairings) -> tuple[IntArray, Pairings]:
+    """Return (K,) rows in the order of the search, and the pairings in that order.
+
+    Sources with few pairings come first, and of a source what is most probable by itself: the robot's error is known
+    well where alternatives begin, and the first set that is complete is about the best, by which others are cut.
+    """
+    count, dim = pairings.innovation.shape
+    at: IntArray = dim * np.arange(count)[:, None] + np.arange(dim)
+    alone = pairings.covariance[at[:, :, None], at[:, None, :]]
+    squared = np.einsum("ki,ki->k", pairings.innovation, np.linalg.solve(alone, pairings.innovation[..., None])[..., 0])
+    score = -0.5 * (squared + np.linalg.slogdet(alone)[1]) - pairings.log_density_new
+    best, level = np.full(pairings.n_sources, -np.inf), np.empty(pairings.n_sources, dtype=np.int64)
+    np.maximum.at(best, pairings.source, score)
+    several = np.bincount(pairings.source, minlength=pairings.n_sources)
+    level[np.lexsort((-best, several))] = np.arange(pairings.n_sources)
+    order: IntArray = np.lexsort((-score, level[pairings.source]))
+    least, rows = pairings.log_det_least, at[order].ravel()
+    ordered = Pairings(
+        level[pairings.source[order]], pairings.target[order], pairings.innovation[order],
+        pairings.covariance[np.ix_(rows, rows)], pairings.log_density_new[order], pairings.n_sources,
+        None if least is None else least[order],
+    )  # fmt: skip
+    return order, ordered
 
 
 def _arguments(
@@ -138,12 +179,16 @@ def _search(
     gate: FloatArray,
     rest: FloatArray,
     weigh_all: bool,
-) -> tuple[IntArray, FloatArray, float]:
+    ignored: float,
+) -> tuple[IntArray, FloatArray, float, bool]:
     """Search depth first; a level of the tree is a source, its branches are the pairings of the source, and none.
 
-    With `weigh_all` every compatible set adds its weight to its pairings, except sets of no weight: `rest`
-    (n_sources + 1,) bounds the contribution of the sources from each level on. Without it, branches that cannot exceed
-    the best set so far are cut.
+    With `weigh_all` every compatible set adds its weight to its pairings, except sets that weigh `ignored` [nats] less
+    than the best: `rest` (n_sources + 1,) bounds the contribution of the sources from each level on. Without it,
+    branches that cannot exceed the best set so far are cut.
+
+    Returns:
+        The best set by source, the weights, their sum [nats], and whether the search was cut by `MAX_NODES`.
     """
     n_sources, n_pairings, dim = len(first) - 1, len(target), innovation.shape[1]
     remaining = np.zeros(n_sources + 1, dtype=np.int64)  # sources from here on with any pairing
@@ -202,7 +247,7 @@ def _search(
             score[level + 1] = (
                 score[level] - 0.5 * (gain + log_det) - 0.5 * dim * np.log(2.0 * np.pi) - log_density_new[k]
             )
-        if weigh_all and score[level + 1] + rest[level + 1] < top - NEGLIGIBLE:
+        if weigh_all and score[level + 1] + rest[level + 1] < top - ignored:
             continue
         if not weigh_all:
             reach = count[level + 1] + remaining[level + 1]
@@ -215,4 +260,4 @@ def _search(
     if total > 0.0:
         weight /= total
         evidence = top + np.log(total)
-    return best, weight, evidence
+    return best, weight, evidence, nodes >= MAX_NODES
