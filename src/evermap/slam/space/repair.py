@@ -56,41 +56,37 @@ def _with_one_turned(optimum: SpatialOptimum) -> SpatialOptimum:
 
     Poses from which little else is seen follow a wrong orientation, so that no vote at their optimum tells of it.
     """
-    smoother, noise, estimate = optimum.smoother, optimum.noise, optimum.estimate
-    problem, gain_nats = smoother.problem, smoother.problem.settings.repair.gain_nats
-    wanted, turned = optimum.now.cost - gain_nats, _turn_places(optimum)
-    rise = problem.share * (
-        _losses(problem, replace(estimate, place=turned), noise) - _losses(problem, estimate, noise)
-    )
-    rise_of_place = np.bincount(problem.place, rise, minlength=len(turned))
-    asked = np.flatnonzero((turned != estimate.place).any(axis=1))
-    for place in asked[np.argsort(rise_of_place[asked], kind="stable")][:MOST_TURNED].tolist():
-        only = np.where(np.arange(len(turned))[:, None] == place, turned, estimate.place)
+    smoother, noise, gain_nats = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
+    starts = [replace(optimum.estimate, place=place) for place in _turned_places(optimum)]
+    cost = [smoother.linearised(start, noise, heavy=False).cost for start in starts]
+    for k in np.argsort(cost, kind="stable")[:MOST_TURNED].tolist():
+        wanted = optimum.now.cost - gain_nats
         found, there = smoother.optimum(
-            replace(estimate, place=only), noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats,
-            wanted=wanted,
-        )  # fmt: skip
+            starts[k], noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats, wanted=wanted
+        )
         if there.cost < wanted:
-            return converged(problem, found, noise, heavy_rounds=0)
+            return converged(smoother.problem, found, noise, heavy_rounds=0)
     return optimum
 
 
-def _turn_places(optimum: SpatialOptimum) -> FloatArray:
-    """Return places (P, 7), each turned as its views say by the explanations that are not taken, if any are left."""
+def _turned_places(optimum: SpatialOptimum) -> list[FloatArray]:
+    """Return places (P, 7), in each of which one is turned as its views say by the explanation that is not taken."""
     problem, estimate, weight = optimum.smoother.problem, optimum.estimate, optimum.now.weight
     sigma = np.hypot(problem.sigma_rad * optimum.noise.pixel, problem.settings.repair.same_rad)
     both = np.stack([as_seen(problem, estimate, measured) for measured in problem.either])
     angle = se3.angle_between(both, estimate.place[problem.place])
     other = np.where((angle[0] < angle[1])[:, None], both[1], both[0])
     asked = np.isfinite(problem.other[:, 3]) & problem.oriented[problem.place]
-    turned = estimate.place.copy()
+    found = list[FloatArray]()
     for place in np.unique(problem.place[asked]).tolist():
         mine = np.flatnonzero(asked & (problem.place == place))
         mine = mine[:: max(1, len(mine) // MOST_CANDIDATES)]
         off = se3.angle_between(other[mine, None], other[mine]) / sigma[mine]
         best = mine[int(np.argmax(np.exp(-0.5 * off**2) @ weight[mine]))]
+        turned = estimate.place.copy()
         turned[place, 3:] = other[best, 3:]
-    return turned
+        found.append(turned)
+    return found
 
 
 def _located_again(optimum: SpatialOptimum) -> SpatialEstimate | None:

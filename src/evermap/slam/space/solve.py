@@ -143,7 +143,6 @@ def solve_space(
     frames = intake.frames
     online = frames.lead_on(stepwise.pose), _rough_spread(frames.since(unsure_s), noise), frames.share_out(step_s)
     estimate, of_points = stepwise, 2 * np.count_nonzero(problem.kind == POINT) > len(problem.kind)
-    solved: SpatialOptimum | None = None
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
         _, estimate = _likeliest(problem.as_points(), noise, [stepwise, whole])
@@ -159,14 +158,12 @@ def solve_space(
             begun = converged(problem, estimate, noise)
             estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
     else:
-        solved = converged(problem, stepwise, noise)
-        if _is_doubtful(solved) or _has_movers(solved):
-            solved = _or_best(solved, by_constellations(problem, noise, SEEDS))
-        estimate = solved.estimate
-    if framed or solved is None:
-        problem, estimate = _in_measured_frame(problem, estimate, framed)
-        solved = converged(problem, estimate, noise)
-    optimum, delays = with_delays(solved)
+        begun = converged(problem, stepwise, noise)
+        if _is_doubtful(begun) or _has_movers(begun):
+            begun = _or_best(begun, by_constellations(problem, noise, SEEDS))
+        estimate, noise = begun.estimate, begun.noise
+    problem, estimate = _in_measured_frame(problem, estimate, framed)
+    optimum, delays = with_delays(converged(problem, estimate, noise))
     if len(stated) and of_points and not problem.driven and (_is_doubtful(optimum) or has_contradictions(optimum)):
         optimum = _or_by_consensus(optimum, stated)
     optimum = repaired(optimum)
