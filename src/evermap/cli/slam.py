@@ -127,6 +127,15 @@ MapPriors = Annotated[
         metavar="[CLASS=]PRIOR|FILE.json",
     ),
 ]
+Start = Annotated[
+    str | None,
+    option(
+        "When the recording began, where its clock starts anew each time: with a zone (Z is UTC), or as the clocks on "
+        "the wall show it.",
+        metavar="DATE",
+        default=False,
+    ),
+]
 Localize = Annotated[
     bool, option("--localize", "With --map: only localise, at a fixed cost per frame; the map is not changed.")
 ]
@@ -184,6 +193,7 @@ Examples:
   evermap slam monday --map building.evermap
   evermap slam tuesday wednesday --map building.evermap --out out/week
   evermap slam tuesday --map building.evermap --localize
+  evermap slam wednesday.bag --map building.evermap --start 2026-11-29T09:30Z
   evermap slam monday --map building.evermap --prior "cart=exponential:half-life=2d" --prior wall=never-leaves
 """
 
@@ -204,6 +214,7 @@ def slam(
     map_file: LivingMapFile = None,
     prior: MapPriors = None,
     localize: Localize = False,
+    start: Start = None,
     shift: Shifts = None,
     together: Together = False,
     realtime: Realtime = False,
@@ -230,7 +241,8 @@ def slam(
     if together:
         single = {"realtime": realtime or None, "topics": topics, "offline_session": offline_session, "robot": robot}
         in_a_map = {"map_file": map_file, "prior": prior, "localize": localize or None, "prior_map": prior_map}
-        refuse_given("is for one robot at a time", "omit it or --together", **single, **in_a_map, **of_prior_map)
+        of_one = {**single, **in_a_map, **of_prior_map, "start": start}
+        refuse_given("is for one robot at a time", "omit it or --together", **of_one)
         _refuse_unread(asked, in_space=False)
         if not _each_together(paths, out, asked):
             raise typer.Exit(EXIT_UNTRUSTWORTHY)
@@ -242,7 +254,9 @@ def slam(
 
     shifts = [parse_shift(text) for text in shift or []]
     asked = asked._replace(prior_map=prior_map, prior_sigma_m=prior_sigma or SURVEY_SIGMA_M, shifts=shifts)
-    asked = asked._replace(map_file=map_file, priors=prior or [], localize=localize)
+    asked = asked._replace(map_file=map_file, priors=prior or [], localize=localize, start=start)
+    if len(paths) > 1:
+        refuse_given("is for one recording", "a command for each, or --set living.clock_gap_s=SECONDS", start=start)
     if len(paths) > 1:
         trustworthy = _each(paths, out, asked)
     elif asked.map_file is None:
@@ -277,6 +291,7 @@ class _Asked(NamedTuple):
     map_file: str | None = None
     priors: Sequence[str] = ()
     localize: bool = False
+    start: str | None = None
 
 
 def _each(paths: Sequence[Path], out: Path | None, asked: _Asked) -> bool:
@@ -308,6 +323,7 @@ def _read_inputs(path: Path, out: Path | None, asked: _Asked) -> tuple[AnyRecord
     """
     from evermap.io import read_recording, shifted
     from evermap.runs.folder import check_replaceable
+    from evermap.runs.session_clock import start_at
 
     if out is not None:  # better now than after the run
         check_replaceable(out, force=asked.force, inputs=asked.inputs)
@@ -315,6 +331,8 @@ def _read_inputs(path: Path, out: Path | None, asked: _Asked) -> tuple[AnyRecord
     if session is not None and session.exists() and not asked.force:
         raise ConfigError(f"{session} is there already", field="offline_session", hint="another name, or --force")
     recording = read_recording(path, robot=asked.robot, topics=asked.topics)
+    if asked.start is not None:
+        recording = start_at(recording, asked.start)
     if session is not None:
         from evermap.io.native_write import write_session
         from evermap.maps.sessions.session import repaired
