@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evermap.config import ExplainConfig
+from evermap.config import SlamConfig
 from evermap.explain.causes import Inputs
 from evermap.explain.competition import find_put_right
 from evermap.explain.shape import compare_shapes
@@ -85,8 +85,22 @@ def test_a_scale_that_the_estimator_found_is_told_as_a_ratio(name: str, value: f
         result: Any = SimpleNamespace(
             parameters=(replace(state, value=value),), trajectory=SimpleNamespace(frame="first_pose")
         )
-        return find_put_right(result, Inputs.of(recording, None), ExplainConfig())
+        return find_put_right(result, Inputs.of(recording, None), SlamConfig())
 
     (cause,) = put_right(value)
     assert (cause.code, cause.value) == (code, pytest.approx(ratio))
     assert put_right(usual + 0.01) == ()
+
+
+@pytest.mark.parametrize(
+    ("unknown_ids", "code"), [(False, "map-identities"), ("empty", "map-identities"), (True, "map-site")]
+)
+def test_without_identities_a_map_of_another_site_is_not_one_of_other_identities(unknown_ids: Any, code: str) -> None:
+    world = World(seconds=4.0)
+    recording, survey = world.plane(), world.map_in_plane()
+    other = replace(survey, landmark_id=survey.landmark_id + 1000)
+    result: Any = SimpleNamespace(parameters=(), trajectory=SimpleNamespace(frame="first_pose"), landmarks=survey)
+    config = SlamConfig(unknown_ids=unknown_ids)
+    assert [one.code for one in find_put_right(result, Inputs.of(recording, other), config)] == [code]
+    few: Any = SimpleNamespace(**{**vars(result), "landmarks": flat(4, 3.0)})
+    assert len(find_put_right(few, Inputs.of(recording, other), config)) == (unknown_ids is not True)

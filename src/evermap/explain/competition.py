@@ -294,7 +294,7 @@ def explain(
         symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
         if not (symptoms or is_suspected):
             sound = Trial(inputs, solution, (), math.nan, 1.0)
-            return Explained(sound, find_put_right(solution.result, inputs, rules))
+            return Explained(sound, find_put_right(solution.result, inputs, config))
         few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
         if symptoms == (CHANGES,) and few and not (is_suspected or _find_score(solution, inputs) > 0.0):
             screens = screens[:1]  # a landmark or two moved, and no calibration earns anything
@@ -316,7 +316,7 @@ def explain(
         return None
     causes = _causes(best, weighed, base)
     named = {cause.code for cause in causes}
-    others = find_put_right(best.solution.result, best.inputs, rules)
+    others = find_put_right(best.solution.result, best.inputs, config)
     return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
 
 
@@ -376,29 +376,31 @@ def _find_score(solution: SessionSolution[VisitT], inputs: Inputs) -> float:
     return max((one.gain for one in scores.harmful), default=0.0)
 
 
-def find_put_right(result: SlamResult, inputs: Inputs, rules: ExplainConfig) -> tuple[Cause, ...]:
+def find_put_right(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[Cause, ...]:
     """Return what the estimator itself found, and has put right in its solution: late clocks, and scales that are
     farther from what is stated than is usual, where a map or a data sheet says which of the two that show together it
     is.
     """
     return (
-        *_find_other_map(result, inputs),
-        *_find_delays(result, rules.late_s),
-        *_find_own_scales(result, inputs, rules.states),
+        *_find_other_map(result, inputs, are_named=config.unknown_ids is not True),
+        *_find_delays(result, config.explain.late_s),
+        *_find_own_scales(result, inputs, config.explain.states),
     )
 
 
-def _find_other_map(result: SlamResult, inputs: Inputs) -> list[Cause]:
-    """Return that the given map is not of what was seen, where no cause lays the one over the other."""
+def _find_other_map(result: SlamResult, inputs: Inputs, *, are_named: bool) -> list[Cause]:
+    """Return that the given map is not of what was seen, where no cause lays the one over the other; `are_named`:
+    whether landmarks were identified before.
+    """
     given, seen = inputs.prior_map, inputs.recording.detections.landmark_id
     if given is None or result.trajectory.frame == "prior_map" or not len(given) or not (seen != UNKNOWN).any():
         return []
-    if not inputs.n_common:
+    if are_named and not inputs.n_common:
         message = "no identity that was seen is in the given map: its identities are others, or it is of another site"
         return [
             Cause("map-identities", "map", message, probability=1.0, fix="--prior-map: the map of these identities")
         ]
-    if inputs.n_common < SHAPE:
+    if (inputs.n_common if are_named else len(result.landmarks)) < SHAPE:
         return []
     message = "what was seen lies nowhere on the given map, in no scale, unit or mirror that was tried: another site"
     return [Cause("map-site", "map", message, probability=1.0, fix="--prior-map: the map of this site")]
