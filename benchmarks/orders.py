@@ -155,7 +155,7 @@ def compare(
         def enter(order: tuple[int, ...]) -> bytes | None:
             if order not in files:
                 before = enter(order[:-1]) if order[1:] else b""
-                files[order] = None if before is None else _entered(path, before, sessions[order[-1]], config)
+                files[order] = None if before is None else _enter(path, before, sessions[order[-1]], config)
             return files[order]
 
         def story(order: tuple[int, ...]) -> Story | None:
@@ -187,7 +187,7 @@ def compare(
     return {**counts, "landmarks": len(wanted["called", 0.0]), "asked": asked.asked, "run": len(asked.answers)}
 
 
-def _entered(path: Path, before: bytes, recording: Recording, config: em.Config | None) -> bytes | None:
+def _enter(path: Path, before: bytes, recording: Recording, config: em.Config | None) -> bytes | None:
     """Return the file after a session; None where it is refused."""
     path.unlink(missing_ok=True)
     if before:

@@ -46,7 +46,7 @@ def tables(days: StreetRun, tmp_path_factory: pytest.TempPathFactory) -> list[De
     return found
 
 
-def joined(tables: list[DetectionTable]) -> DetectionTable:
+def join_tables(tables: list[DetectionTable]) -> DetectionTable:
     """Return one table of successive ones."""
     first = [np.zeros(1, dtype=np.int64)]
     for table in tables:
@@ -72,7 +72,7 @@ def test_track_finds_what_slam_finds(days: StreetRun, tables: list[DetectionTabl
 
 def test_two_days_by_a_saved_state_are_two_days_in_one_table(tables: list[DetectionTable], tmp_path: Path) -> None:
     """Also of those that were seen for too short to enter the tracker's own spells, and had left the next day."""
-    whole = run_track(joined(tables), SEEN).spells
+    whole = run_track(join_tables(tables), SEEN).spells
     for k, table in enumerate(tables):
         tracker = make_tracker(table, SEEN, state=tmp_path / "state" if k else None)
         spells = run_track(table, SEEN, tracker=tracker).spells

@@ -257,7 +257,6 @@ def slam(
     asked = asked._replace(map_file=map_file, priors=prior or [], localize=localize, start=start)
     if len(paths) > 1:
         refuse_given("is for one recording", "a command for each, or --set living.clock_gap_s=SECONDS", start=start)
-    if len(paths) > 1:
         trustworthy = _each(paths, out, asked)
     elif asked.map_file is None:
         trustworthy = _run_alone(*_read_inputs(paths[0], out, asked), asked)

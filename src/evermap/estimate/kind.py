@@ -111,6 +111,10 @@ class MeasurementKind:
         """Whether it says where up is in a frame whose z axis is up, but not where that frame is."""
         return self.frame is None and max(self.first_sigma[3:5]) > LEVEL_RAD
 
+    def fill_in(self, columns: Columns, count: int) -> dict[str, FloatArray]:
+        """Return columns (count,) with those that were left out, at what they are then."""
+        return {name: np.full(count, value, dtype=np.float64) for name, value in self.optional.items()} | dict(columns)
+
 
 def stacked(columns: Columns, *names: str) -> FloatArray:
     """Return (K, n) some columns beside each other."""

@@ -49,8 +49,7 @@ def tie_measurements(
             other, other_after = _instants(stamp_s, to_s[some], move)
         elif len(other):
             other = other[some]
-        columns = {name: np.full(len(some), value, dtype=np.float64) for name, value in kind.optional.items()}
-        columns |= {name: column[some] for name, column in table.columns.items()}
+        columns = {name: column[some] for name, column in kind.fill_in(table.columns, len(table)).items()}
         found.append(Tied(kind, columns, row, after, other, other_after))
     return tuple(found), remarks
 

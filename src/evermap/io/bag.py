@@ -402,8 +402,7 @@ def _measurements(
             warnings.append(f"{name} of {topic}: {made.remark}")
         if len(made.stamp_s):
             nowhere = np.full(len(made.stamp_s), UNKNOWN)
-            left_out = {key: np.full(len(nowhere), value) for key, value in kind.optional.items()}
-            found.append(Measurements(name, made.stamp_s, left_out | dict(made.columns), nowhere))
+            found.append(Measurements(name, made.stamp_s, kind.fill_in(made.columns, len(nowhere)), nowhere))
     return tuple(found)
 
 

@@ -149,8 +149,7 @@ def _is_level_by_measurements(recording: SpatialRecording) -> bool:
     for table in recording.measurements:
         if table.kind != "floor":
             continue
-        columns = {name: np.full(len(table), value) for name, value in find_kinds()["floor"].optional.items()}
-        columns |= table.columns
+        columns = find_kinds()["floor"].fill_in(table.columns, len(table))
         for name, sigma, least in (
             ("z_m", "sigma_z_m", LEVEL_M),
             *((f"up_{axis}", "sigma_tilt", LEVEL_RAD) for axis in "xy"),

@@ -22,7 +22,7 @@ OFF_PX = 0.35
 """Half of the standard deviation of a disparity, which is 0.5 sqrt(2) px: an error as it is usual."""
 
 
-def carried(seed: int, bias_px: float, **more: float) -> SpatialRecording:
+def carry_stereo(seed: int, bias_px: float, **more: float) -> SpatialRecording:
     return Rig(seed, bias_px=bias_px, seconds=40.0, gaps=0, turns=2, **more).walk()
 
 
@@ -53,11 +53,11 @@ def nees_of_distances(recording: SpatialRecording) -> FloatArray:
 @pytest.mark.parametrize("bias_px", [OFF_PX, -OFF_PX])
 def test_a_session_does_not_know_its_metre_better_than_its_disparities(bias_px: float):
     """NEES of distances is 20 to 40 times its expectation if errors of single pixels are all that there is."""
-    assert 0.3 < np.mean(nees_of_distances(carried(3, bias_px))) < 2.0
+    assert 0.3 < np.mean(nees_of_distances(carry_stereo(3, bias_px))) < 2.0
 
 
 def test_the_result_says_so_too():
-    recording = carried(3, -OFF_PX)
+    recording = carry_stereo(3, -OFF_PX)
     result = run_slam(recording)
     scores = compare_with_truth(recording, result)
     assert scores.landmarks_anchored is not None
@@ -72,7 +72,7 @@ def test_the_result_says_so_too():
 
 
 def test_an_error_moves_places_as_solving_with_it_does():
-    recording = carried(3, 0.0)
+    recording = carry_stereo(3, 0.0)
     solved = solve(recording)
     optimum = solved.optimum
     smoother, _ = optimum.last
@@ -88,16 +88,16 @@ def test_an_error_moves_places_as_solving_with_it_does():
 
 
 def test_odometry_or_a_map_tell_the_metre():
-    driven = carried(3, OFF_PX, drift=0.01)
+    driven = carry_stereo(3, OFF_PX, drift=0.01)
     assert consider_range_errors(solve(driven).optimum).shape[1] == 0
-    recording = carried(3, OFF_PX)
+    recording = carry_stereo(3, OFF_PX)
     assert recording.true_landmarks is not None
     known = recording.true_landmarks.as_prior(0.02)
     assert consider_range_errors(solve(recording, known).optimum).shape[1] == 0
 
 
 def test_without_odometry_a_data_sheet_says_how_well_the_metre_is_known():
-    recording = carried(3, 0.0)
+    recording = carry_stereo(3, 0.0)
     stated = replace(recording, sensors=tuple(replace(one, sigma_scale=0.02) for one in recording.sensors))
     known = recording.true_landmarks
     assert known is not None

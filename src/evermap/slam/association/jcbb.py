@@ -71,7 +71,7 @@ def most_pairings(pairings: Pairings, *, confidence: float = 0.99) -> IntArray:
     Returns:
         (n_sources,) the row of `Pairings` of every source, -1 for none.
     """
-    order, ordered = _ordered(pairings)
+    order, ordered = _sort_pairings(pairings)
     found = _search(*_arguments(ordered, confidence), False, NEGLIGIBLE)[0]
     chosen, rows = np.full(pairings.n_sources, -1), order[found[found >= 0]]
     chosen[pairings.source[rows]] = rows
@@ -84,7 +84,7 @@ def pairing_probability(pairings: Pairings, *, confidence: float = 0.99) -> tupl
     Returns:
         These, and the evidence of all sets together over only new sources [nats].
     """
-    order, ordered = _ordered(pairings)
+    order, ordered = _sort_pairings(pairings)
     arguments, ignored = _arguments(ordered, confidence), NEGLIGIBLE
     _, found, evidence, is_cut = _search(*arguments, True, ignored)
     while is_cut and ignored > NARROWEST:
@@ -95,7 +95,7 @@ def pairing_probability(pairings: Pairings, *, confidence: float = 0.99) -> tupl
     return probability, evidence
 
 
-def _ordered(pairings: Pairings) -> tuple[IntArray, Pairings]:
+def _sort_pairings(pairings: Pairings) -> tuple[IntArray, Pairings]:
     """Return (K,) rows in the order of the search, and the pairings in that order.
 
     Sources with few pairings come first, and of a source what is most probable by itself: the robot's error is known

@@ -85,11 +85,11 @@ class _Told:
     of_ranges: FloatArray
     up: Up = field(default_factory=Up)
 
-    def considered(self, variable: IntArray, dim: int) -> FloatArray:
-        """Return (K, dim, dim) what errors of ranges add to the covariances of variables (K,)."""
+    def add_range_errors(self, covariance: FloatArray, variable: IntArray) -> FloatArray:
+        """Return covariances (K, d, d) of variables (K,) with what errors that all ranges share add to them."""
         begin = self.solved.optimum.smoother.structure.system.tree.begin[variable]
-        own = self.of_ranges[begin[:, None] + np.arange(dim)]
-        return np.asarray(own @ np.swapaxes(own, 1, 2))
+        own = self.of_ranges[begin[:, None] + np.arange(covariance.shape[-1])]
+        return np.asarray(covariance + own @ np.swapaxes(own, 1, 2))
 
 
 def concluded_in_space(
@@ -141,7 +141,7 @@ def _trajectory(told: _Told, found: BoolArray) -> Trajectory:
     pose = bridge(frames, problem, optimum.estimate, optimum.noise)
     noise, weight = optimum.sober or optimum.noise, optimum.now.odometry_weight
     covariance = bridge_covariance(frames, problem, optimum.estimate, noise, weight, told.spread)
-    covariance += told.considered(frames.before, 6)
+    covariance = told.add_range_errors(covariance, frames.before)
     covariance = add_scale_error(covariance, -se3.inverse(pose)[:, :3], _undivided(told))
     of = slice(None) if problem.driven else found
     return _path(told, pose, covariance, of)
@@ -213,8 +213,8 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     hits, first, last = count_sightings(count, problem.place[used], seen_s, problem.measurements, told.stamp_s)
     covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
     points, turns = np.flatnonzero(~problem.oriented), np.flatnonzero(problem.oriented)
-    covariance[points] = told.spread.of(n + points, 3) + told.considered(n + points, 3)
-    own, axes = told.spread.of(n + turns, 6) + told.considered(n + turns, 6), se3.rotation_of(place[turns])
+    covariance[points] = told.add_range_errors(told.spread.of(n + points, 3), n + points)
+    own, axes = told.add_range_errors(told.spread.of(n + turns, 6), n + turns), se3.rotation_of(place[turns])
     covariance[turns] = axes @ own[:, :3, :3] @ np.swapaxes(axes, 1, 2)  # a twist's translation is in the own axes
     turned[turns] = own[:, 3:, 3:]
     covariance = add_scale_error(covariance, place[:, :3], _undivided(told))
