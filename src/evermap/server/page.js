@@ -212,9 +212,10 @@ function paint() {
   });
   for (const change of told.filter((one) => one.kind === "moved" && one.displacement_m.every((x) => x !== null))) {
     for (const one of change.landmarks.map((id) => of.get(id)).filter(Boolean)) {
-      const [dx, dy] = change.displacement_m, [x, y] = [one.x_m, -one.y_m], turn = Math.atan2(-dy, dx);
+      const [dx, dy] = change.displacement_m, turn = Math.atan2(-dy, dx), short = Math.min(1.5 * size, Math.hypot(dx, dy) / 2);
+      const [x, y] = [one.x_m - short * Math.cos(turn), -one.y_m - short * Math.sin(turn)]; // the landmark stays visible
       const tip = (angle) => `${x - 2 * size * Math.cos(turn + angle)} ${y - 2 * size * Math.sin(turn + angle)}`;
-      const d = `M${x - dx} ${y + dy}L${x} ${y}M${tip(0.5)}L${x} ${y}L${tip(-0.5)}`;
+      const d = `M${one.x_m - dx} ${dy - one.y_m}L${x} ${y}M${tip(0.5)}L${x} ${y}L${tip(-0.5)}`;
       nodes.push(shape("path", { d, "stroke-width": 1.2 * size }, "halo"), shape("path", { d, "stroke-width": size / 2 }, "moved"));
     }
   }
