@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import pytest
 
 pytest.importorskip("fastapi", reason="a server needs evermap[server]")
@@ -442,6 +443,23 @@ def test_what_probably_does_not_exist_is_faint_whatever_is_told_of_it(site: Site
     assert drawn(1.0, "appeared") == (1.0, True, 1.0, 255)
     assert drawn(0.9, "vanished")[1:] == (False, None, 0)
     assert drawn(0.001, "moved")[0] == 0.2  # still to be found
+
+
+def test_an_arrow_ends_beside_the_landmark_that_moved(site: Site, browser: Browser) -> None:
+    browser.show(*LOOKS["light"])
+    browser.log_in(site.address, site.tokens["read"])
+    one = {"landmark": 1, "label": "1", "class": "cart", "x_m": 1.0, "y_m": 2.0, "p_exists": 1.0, "deleted": False}
+    other = {**one, "landmark": 2, "label": "2", "x_m": 9.0}
+    told = {"kind": "moved", "landmarks": [1], "displacement_m": [3.0, 4.0], "rotation_rad": 0.0, "probability": 0.99}
+    browser.value(f"draw([{json.dumps(one)}, {json.dumps(other)}], [{json.dumps(told)}])")
+    browser.painted()
+    browser.value("paint()")  # at the size that the page has with its legend
+    d = browser.value("document.querySelector('#map .moved').getAttribute('d')")
+    begin, end = (np.array(part.split(), dtype=float) for part in d.removeprefix("M").split("M")[0].split("L"))
+    np.testing.assert_allclose(begin, [-2.0, 2.0])  # y of the screen points down
+    away = end - [1.0, -2.0]
+    np.testing.assert_allclose(away / np.linalg.norm(away), [-0.6, 0.8], atol=1e-9)
+    assert np.linalg.norm(away) == pytest.approx(1.5 * browser.value("RADIUS * metre()"))
 
 
 def test_landmarks_are_named_under_the_pointer_and_as_their_names_are_typed(site: Site, browser: Browser) -> None:
