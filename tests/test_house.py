@@ -24,7 +24,7 @@ def tree_of(name: str) -> ast.Module:
 SETTLED = (
     "live", "maps.sessions", "runs.persist", "sensing", "slam.association", "slam.changes", "slam.space", "tracking",
 )  # fmt: skip
-"""Packages whose beliefs and thresholds are keys of the configuration: see docs/architecture.md."""
+"""Packages whose beliefs and thresholds are keys of the configuration: see docs/contracts.md."""
 SETTLED_MODULES = ("batch", "calibration", "known_places", "localize", "problem", "streaming", "votes")
 BELIEF = re.compile(
     r"_(M|M2|S|RAD|HZ|MPS|PX|NATS|P|ODDS)$|^_?(P|SIGMA|FEWEST|LEAST|GATE|CONFIDENCE|MIN|SEEN|SURE|NEAR|FAR)(_|$)"
