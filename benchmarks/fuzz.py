@@ -741,7 +741,7 @@ def _read_looks(path: Path) -> Any:
 
 
 def _read_detections(path: Path) -> Any:
-    from evermap.runs.track.detections import read_detections
+    from evermap.tracking.detections import read_detections
 
     return plain(read_detections(path))
 

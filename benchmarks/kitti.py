@@ -19,7 +19,7 @@ from benchmarks.kitti_score import LEAST_PX, MOST_OCCLUDED, MOST_TRUNCATED, Judg
 from benchmarks.overlap import overlap
 from evermap.config import TrackConfig
 from evermap.errors import InputError
-from evermap.runs.track.detections import read_input
+from evermap.tracking.detections import read_input
 from evermap.tracking.run import run_track, warm_up
 from evermap.tracking.tracklets import TrackState
 from evermap.types import BoolArray, FloatArray, IntArray

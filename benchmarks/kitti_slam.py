@@ -21,8 +21,8 @@ from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.io import read_recording
 from evermap.pipeline import run_slam
-from evermap.runs.track.detections import read_input
 from evermap.slam.space.moving import has_traffic
+from evermap.tracking.detections import read_input
 from evermap.tracking.run import run_track
 from evermap.types import UNKNOWN, FloatArray, SlamResult, SpatialOdometry, SpatialRecording
 

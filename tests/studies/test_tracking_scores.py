@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import DataError
-from evermap.runs.track.detections import read_input
 from evermap.runs.track.write import write_track
+from evermap.tracking.detections import read_input
 from evermap.tracking.run import run_track
 from evermap_studies.lifetimes.tracking_scores import Points, TrackingScores, score_tracks
 

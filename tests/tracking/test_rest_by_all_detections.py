@@ -12,7 +12,7 @@ import pytest
 from evermap.config import TrackConfig
 from evermap.io import write_native
 from evermap.pipeline import run_slam
-from evermap.runs.track.detections import read_input
+from evermap.tracking.detections import read_input
 from evermap.tracking.frame import DetectionTable
 from evermap.tracking.record import Event, SpellLog, StaticSpells
 from evermap.tracking.run import find_misses, make_tracker, run_track

@@ -12,9 +12,9 @@ import evermap as em
 from evermap.config import TrackConfig
 from evermap.errors import ConfigError, InputError
 from evermap.runs.examples import RANGE_M, write_detections
-from evermap.runs.track.detections import read_detections
 from evermap.survival import GeneralPurpose
 from evermap.survival.censored import CensoredLifetimes
+from evermap.tracking.detections import read_detections
 from evermap.tracking.frame import DetectionTable
 from evermap.tracking.record import StaticSpells
 from evermap.tracking.run import TrackResult, make_tracker, run_track

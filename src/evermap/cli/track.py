@@ -172,8 +172,8 @@ def _run(
     """Read, run, write; return the summary."""
     from evermap.runs.folder import check_replaceable
     from evermap.runs.summary import RunInfo
-    from evermap.runs.track.detections import read_confusion, read_input
     from evermap.runs.track.write import write_track
+    from evermap.tracking.detections import read_confusion, read_input
     from evermap.tracking.run import check_choices, make_tracker, run_track
     from evermap.tracking.run import warm_up as compile_kernels
 

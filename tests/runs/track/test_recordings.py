@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from evermap.cli.main import app
 from evermap.config import TrackConfig
 from evermap.errors import DataError
-from evermap.runs.track.detections import read_input
+from evermap.tracking.detections import read_input
 from evermap.tracking.run import run_track
 
 

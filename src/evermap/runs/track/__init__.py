@@ -1,5 +1,5 @@
 """Objects over time: `evermap track` makes lifetimes of detections, `evermap survival fit` makes priors of lifetimes.
 
-Tables, runs, folders and reports; the tracker itself is `evermap.tracking`, the estimators are in `evermap.survival`.
-Submodules are imported by name: this package itself loads nothing.
+Folders, tables and lifetimes of a run. The tracker and the reader of detections are in `evermap.tracking`, the
+estimators in `evermap.survival`. Submodules are imported by name: this package itself loads nothing.
 """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import EvermapError
-from evermap.runs.track.detections import read_detections
+from evermap.tracking.detections import read_detections
 from evermap.types import UNKNOWN
 
 HEAD = "stamp_s,x_m,y_m,z_m"

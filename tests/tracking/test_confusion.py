@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import EvermapError
-from evermap.runs.track.detections import read_confusion, read_detections
+from evermap.tracking.detections import read_confusion, read_detections
 from evermap.tracking.run import run_track
 
 CLASSES = ("bus", "car")

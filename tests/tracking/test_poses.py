@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from evermap.config import TrackConfig
 from evermap.errors import EvermapError
-from evermap.runs.track.detections import read_input, read_poses
 from evermap.runs.track.write import write_track
+from evermap.tracking.detections import read_input, read_poses
 from evermap.tracking.run import run_track
 
 BOX = "length_m,width_m,height_m,yaw_rad"
