@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from evermap.slam.check import check_recording
     from evermap.slam.localize import Localizer
     from evermap.survival.text import parse_prior
+    from evermap.tracking.detections import read_detections
     from evermap.tracking.run import run_track
     from evermap.tracking.tracker import Tracker
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
@@ -59,6 +60,7 @@ _HOME = {
     "evermap.runs.persist.run": ("run_persist",),
     "evermap.runs.persist.table": ("read_looks",),
     "evermap.runs.sessions": ("Entered", "enter_session"),
+    "evermap.tracking.detections": ("read_detections",),
     "evermap.tracking.run": ("run_track",),
     "evermap.slam.check": ("check_recording",),
     "evermap.slam.localize": ("Localizer",),
@@ -96,6 +98,7 @@ __all__ = [
     "load_config",
     "open_store",
     "parse_prior",
+    "read_detections",
     "read_looks",
     "read_recording",
     "recover",

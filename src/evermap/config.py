@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from evermap.errors import ConfigError, similar, suggestion
-from evermap.types import NOT_IN_SPACE, FloatArray, Sensor, SensorKind, SpatialSensor
+from evermap.types import DEFAULT_PRIOR, NOT_IN_SPACE, FloatArray, Sensor, SensorKind, SpatialSensor
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -1102,8 +1102,6 @@ class LiveConfig(Section):
     look_s: Positive = key(0.5, "time between two frames whose looks are used for that [s]")
 
 
-DEFAULT_PRIOR = "unknown:1min..10y"
-"""From a cup that is put down to a wall: every order of magnitude of the mean stay is equally likely."""
 NO_RECURRENCE = "none"
 
 

@@ -45,6 +45,9 @@ Progress = Callable[[float, float], None]
 
 UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""
+DEFAULT_PRIOR = "unknown:1min..10y"
+"""Lifetime of what nothing is known of, from a cup that is put down to a wall: every order of magnitude of the mean
+stay is equally likely."""
 
 
 class Tabular(ShownTable):

@@ -20,7 +20,7 @@ from evermap.existence.recursion import LARGEST, LOG_LARGEST, aged, observed, od
 from evermap.show import Shown
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, never_leaves, parse_prior
 from evermap.survival.text import prior_text
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import DEFAULT_PRIOR, BoolArray, FloatArray, IntArray
 
 _ANSWERS = (0, 1)
 
@@ -31,7 +31,8 @@ class PersistenceFilter(Shown):
     Times count from the feature's birth, in seconds; it is certainly there at 0.
 
     Args:
-        prior: how long such features stay; a text such as `exponential:half-life=30d` is read as one.
+        prior: how long such features stay; a text such as `exponential:half-life=30d` is read as one. The default is
+            that of what nothing is known of.
 
     Raises:
         ConfigError, InputError: `prior` is not a lifetime prior.
@@ -39,7 +40,7 @@ class PersistenceFilter(Shown):
 
     __slots__ = ("_death_odds", "_evidence", "_inverse_odds", "_stamp")
 
-    def __init__(self, prior: LifetimePrior | str) -> None:
+    def __init__(self, prior: LifetimePrior | str = DEFAULT_PRIOR) -> None:
         self._death_odds = _death_odds_under(as_prior(prior))
         self._inverse_odds = 0.0
         self._stamp = 0.0
@@ -78,7 +79,7 @@ class PersistenceFilter(Shown):
             raise self._refusal(stamp_s, 0.0, 0.0)
         return float(1.0 / (1.0 + aged(self._inverse_odds, self._death_odds(self._stamp, stamp_s))))
 
-    def update(self, stamp_s: float, detected: bool, p_miss: float, p_false: float) -> float:
+    def update(self, stamp_s: float, detected: bool, p_miss: float = 0.1, p_false: float = 0.1) -> float:
         """Take in one look at the feature, and return the probability that it exists then.
 
         Args:

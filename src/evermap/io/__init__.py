@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from evermap.errors import InputError
 from evermap.io.bag import BAG, read_bag
+from evermap.io.columns import DataFrame
 from evermap.io.file_kinds import kind_of_file, kind_of_folder
 from evermap.io.files import Reader, file_sets, find_file_set, head_of, refuse_pointer
 from evermap.io.landmarks import write_map_geojson, write_map_parquet
 from evermap.io.map_formats import read_landmarks, read_prior_map
 from evermap.io.mrclam import MRCLAM, read_mrclam
-from evermap.io.native import NATIVE, read_native
+from evermap.io.native import NATIVE, read_native, read_tables
 from evermap.io.native_write import write_native
 from evermap.io.pose_graph import POSE_GRAPH
 from evermap.io.shifts import Shift, parse_shift, shifted
@@ -33,6 +36,7 @@ __all__ = [
     "read_planar",
     "read_prior_map",
     "read_recording",
+    "read_tables",
     "read_tum",
     "reader_for",
     "shifted",
@@ -76,12 +80,15 @@ def reader_for(path: str | Path) -> Reader:
 
 
 def read_recording(
-    path: str | Path, robot: int | None = None, *, topics: str | Path | None = None
+    source: str | Path | Mapping[str, DataFrame | Mapping[str, Any]],
+    robot: int | None = None,
+    *,
+    topics: str | Path | None = None,
 ) -> Recording | SpatialRecording:
     """Read a recording of any known format, in the plane or in space.
 
     Args:
-        path: folder, zip or file.
+        source: folder, zip or file; or data frames by name, as of `read_tables`.
         robot: number of the robot where the format has several; None for its first complete one.
         topics: file that states which topics of a bag are what; None for the one beside it, or a guess.
 
@@ -89,12 +96,16 @@ def read_recording(
         InputError: missing, malformed or of an unknown format.
         DataError: well-formed, but nothing can be estimated from it.
     """
-    reader = reader_for(path)
+    if isinstance(source, Mapping):
+        if robot is not None or topics is not None:
+            raise InputError("data frames are of one robot, without topics", hint="omit robot and topics")
+        return read_tables(source)
+    reader = reader_for(source)
     if topics is None:
-        return reader.read(Path(path), robot)
+        return reader.read(Path(source), robot)
     if reader is not BAG:
-        raise InputError("has no topics", path=path, hint="omit --topics; it is for bags")
-    return read_bag(path, robot, topics)
+        raise InputError("has no topics", path=source, hint="omit --topics; it is for bags")
+    return read_bag(source, robot, topics)
 
 
 def read_planar(path: str | Path, robot: int | None = None) -> Recording:

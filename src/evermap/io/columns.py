@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -40,6 +40,18 @@ from evermap.valid import Quantity
 
 _BATCH_ROWS = 1 << 18
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
+
+
+@runtime_checkable
+class DataFrame(Protocol):
+    """A table in memory that exports an Arrow stream: of pandas, polars, pyarrow, DuckDB."""
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Return a capsule of the stream (Arrow PyCapsule interface)."""
+
+
+TableSource: TypeAlias = str | Path | DataFrame
+"""A file with a table, or a data frame."""
 
 
 class Columns(NamedColumns):
@@ -130,24 +142,61 @@ class Columns(NamedColumns):
         return floats_of(cells)
 
 
-def read_columns(path: str | Path, warnings: list[str]) -> Columns:
-    """Return a `.csv`, `.csv.gz` or `.parquet` file, or a folder of the latter; `warnings` gets a remark on an
-    unfinished last line.
+def read_columns(source: TableSource, warnings: list[str]) -> Columns:
+    """Return a `.csv`, `.csv.gz` or `.parquet` file, a folder of the latter, or a data frame; `warnings` gets a remark
+    on an unfinished last line.
 
     Raises:
         InputError: it is missing, damaged, or no table.
     """
-    path = Path(path)
+    if isinstance(source, DataFrame):
+        return _of_arrow(arrow_table(source), path_of(source))
+    path = path_of(source)
     if path.is_dir() and parquet_files(path):
         return _joined(list(parquet_batches(path)))
     data = _content(path)
     if data[:4] == b"PAR1":
-        table = read_parquet(data, path)
-        cells = {name: one_array(column) for name, column in zip(table.column_names, table.columns, strict=True)}
-        return Columns(path, cells, np.arange(1, table.num_rows + 1))
+        return _of_arrow(read_parquet(data, path), path)
     parsed = parse_csv(data, path, warnings)
     cells = {name: arrow_cells(list(c)) if isinstance(c, Sequence) else c for name, c in parsed.columns.items()}
     return Columns(path, cells, parsed.line, parsed.header_line)
+
+
+def path_of(source: object) -> Path:
+    """Return the path of a table for messages, of a data frame what it is.
+
+    Raises:
+        InputError: neither a path nor a data frame.
+    """
+    if isinstance(source, str | Path):
+        return Path(source)
+    if isinstance(source, DataFrame):
+        return Path(f"{type(source).__module__.partition('.')[0]} data frame")
+    problem = f"{type(source).__name__} is neither a file nor a data frame"
+    raise InputError(problem, hint="a path, or a table of pandas, polars or pyarrow")
+
+
+def arrow_table(frame: DataFrame) -> Any:
+    """Return a data frame as a pyarrow table, without an index that has no name.
+
+    Raises:
+        InputError: cells of a column are of several types, or a column appears twice.
+    """
+    path = path_of(frame)
+    try:
+        table = pa.table(frame)
+    except (pa.ArrowException, ValueError, TypeError) as error:
+        raise InputError(f"cannot be read: {reason(error)}", path=path, hint="one type a column") from error
+    names = [name for name in table.column_names if not name.startswith("__index_level_")]
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise InputError("appears twice", path=path, field=twice, hint="one column a name")
+    return table.select(names)
+
+
+def _of_arrow(table: Any, path: Path) -> Columns:
+    cells = {name: one_array(column) for name, column in zip(table.column_names, table.columns, strict=True)}
+    return Columns(path, cells, np.arange(1, table.num_rows + 1))
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:

@@ -13,7 +13,7 @@ import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -29,19 +29,21 @@ _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeEr
 
 @dataclass(frozen=True, slots=True)
 class FileSet:
-    """The files of one folder, on disk or inside a zip.
+    """The files of one folder, on disk, inside a zip, or in memory.
 
     Attributes:
-        root: the folder or zip that the user named.
+        root: the folder or zip that the user named; of files in memory what they are, for messages.
         folder: the folder inside `root`, '' for the top.
         members: file name -> path relative to `root`.
         zipped: whether `root` is a zip.
+        contents: file name -> content of files in memory; None where they are on disk.
     """
 
     root: Path
     folder: str
     members: dict[str, str]
     zipped: bool
+    contents: Mapping[str, bytes] | None = None
 
     def __contains__(self, name: str) -> bool:
         return name in self.members
@@ -66,6 +68,8 @@ class FileSet:
         path = self.path_of(name)
         if name not in self.members:
             raise InputError("file is missing", path=path)
+        if self.contents is not None:
+            return self.contents[name]
         if not self.zipped:
             return content_of(path)
         try:

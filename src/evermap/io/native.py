@@ -5,21 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from evermap import valid as q
-from evermap.errors import DataError, InputError, similar
+from evermap.errors import DataError, InputError, similar, suggestion
 from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.bad_rows import Flaw, flaw_of
+from evermap.io.columns import DataFrame, arrow_table
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import class_ids, distinct_labels, feature_columns, features_of, survey_of
 from evermap.io.measurements import measurement_names, read_measurements
 from evermap.io.native_space import in_space, spatial_recording, truth_of
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
-from evermap.io.sensor_toml import Settings, parse_sensor_toml
-from evermap.io.table import ENDINGS, Table, parse_table
+from evermap.io.sensor_toml import Settings, parse_sensor_toml, toml_text
+from evermap.io.table import ENDINGS, Table, parquet_of, parse_table
 from evermap.io.tagslam import is_tagslam
 from evermap.types import (
     Clock,
@@ -62,6 +64,40 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
     if robot is not None:
         problem = f"there is no robot {robot}: a native recording has one robot"
         raise InputError(problem, path=path, hint="omit the robot")
+    return _recording_of(files, str(path))
+
+
+def read_tables(tables: Mapping[str, DataFrame | Mapping[str, Any]]) -> Recording | SpatialRecording:
+    """Return a recording from data frames: what `read_native` reads from a folder, by the names of its files.
+
+    Args:
+        tables: `odometry`, `detections`, and optionally the other tables, each a data frame with the columns of the
+            file; `sensor` and `camera` are the sections of `sensor.toml` and `camera.toml`, as dictionaries.
+
+    Raises:
+        InputError, DataError: as of `read_native`; a name that no file has, or something else than a data frame.
+    """
+    memory, contents = Path("tables"), dict[str, bytes]()
+    settings = {Path(file).stem: file for file in (SENSOR_FILE, CAMERA_FILE)}
+    known = (*TABLES, *measurement_names(), *settings)
+    for name, table in tables.items():
+        if name not in known:
+            raise InputError(
+                "is no table of a recording", path=memory, field=str(name)[:40], hint=suggestion(name, known)
+            )
+        if name in settings:
+            if not isinstance(table, Mapping):
+                raise InputError("is no dictionary", path=memory, field=name, hint=f"the sections of {settings[name]}")
+            contents[settings[name]] = toml_text({key: dict(part) for key, part in table.items()}).encode()
+        elif isinstance(table, DataFrame):
+            contents[f"{name}.parquet"] = parquet_of(arrow_table(table))
+        else:
+            raise InputError("is no data frame", path=memory, field=name, hint="a table of pandas, polars or pyarrow")
+    return _recording_of(FileSet(memory, "", {name: name for name in contents}, zipped=False, contents=contents), "")
+
+
+def _recording_of(files: FileSet, source: str) -> Recording | SpatialRecording:
+    """Return what the files of a native recording hold."""
     warnings: list[str] = []
     _warn_of_similar_names(files, warnings)
     tables = {name: _read_table(files, name, warnings) for name in (*TABLES, *measurement_names())}
@@ -72,7 +108,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
         planar, table = None, tables["odometry"]
         if table is not None and table.has_any((*_VELOCITIES, *_INCREMENTS)):
             planar, tables = _odometry(table, rig.settings.clock, warnings), {**tables, "odometry": None}
-        found = spatial_recording(tables, rig, planar, title=files.title, source=str(path), warnings=warnings)
+        found = spatial_recording(tables, rig, planar, title=files.title, source=source, warnings=warnings)
         return replace(found, objects=_objects(tables["objects"], dict(found.landmark_names)))
     settings = _on_clock(_read_settings(files, warnings), tables, files)
     clock, driven = settings.clock, _needed("odometry", tables, files)
@@ -93,7 +129,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
         robot_sightings=_robot_sightings(tables["robot_sightings"], clock, warnings),
         objects=_objects(tables["objects"], names),
         class_names=class_names,
-        source=str(path),
+        source=source,
         clock=clock,
         robot=settings.robot,
         landmark_names=names,

@@ -430,9 +430,13 @@ def parquet_bytes(columns: Mapping[str, Any], metadata: dict[str, str] | None = 
         arrow_cells(cells, np.array([*map(bool, cells)], dtype=np.bool_) if isinstance(cells, list) else None)
         for cells in columns.values()
     ]
-    table = pa.Table.from_arrays(arrays, names=list(columns))
+    return parquet_of(pa.Table.from_arrays(arrays, names=list(columns)).replace_schema_metadata(metadata or {}))
+
+
+def parquet_of(table: Any) -> bytes:
+    """Return a pyarrow table as a Parquet file, with checksums against later damage."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table.replace_schema_metadata(metadata or {}), sink, compression="zstd", write_page_checksum=True)
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
     return bytes(sink.getvalue().to_pybytes())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.errors import ConfigError, DataError, InputError
 from evermap.geometry import se3
 from evermap.io import read_recording
-from evermap.io.columns import Columns, read_columns
+from evermap.io.columns import Columns, DataFrame, TableSource, path_of, read_columns
 from evermap.io.native_space import IMAGE_BOX
 from evermap.io.spatial import BOX as SIDES
 from evermap.io.spatial import COVARIANCE
@@ -29,23 +29,25 @@ SENSOR = tuple(replace(axis, name=f"sensor_{axis.name}", hint="metres, in every 
 SIGMA = Quantity("sigma_m", 0.0, 1e6, positive=True, optional=True, hint="metres; empty where unknown")
 SCORE = Quantity("score", -1e9, 1e9, optional=True, hint="the detector's confidence, on any scale")
 _HINT = "metres, in every row with a position"
-SIZE = tuple(Quantity(name, 0.0, 1e4, positive=True, optional=True, hint=_HINT) for name in SIDES)
-YAW = Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, counter-clockwise from x")
-BOX = (*SIZE, YAW)
+BOX = (
+    *(Quantity(name, 0.0, 1e4, positive=True, optional=True, hint=_HINT) for name in SIDES),
+    Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, counter-clockwise from x"),
+)
 _REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
 _OPTIONAL = (
     "class_id", *COVARIANCE, SIGMA.name, SCORE.name, *(quantity.name for quantity in (*BOX, *SENSOR)), *IMAGE_BOX,
 )  # fmt: skip
 
 
-def read_detections(path: str | Path, *, min_score: float | None = None) -> DetectionTable:
+def read_detections(source: TableSource, *, min_score: float | None = None) -> DetectionTable:
     """Return a table with `stamp_s, x_m, y_m, z_m` and perhaps class, box, covariance, score, appearance and the
     sensor's position.
 
     A row without a position is a frame in which nothing was detected.
 
     Args:
-        path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order, those of one stamp are a frame.
+        source: a `.csv`, `.csv.gz` or `.parquet` file, or a data frame; rows in any order, those of one stamp are a
+            frame.
         min_score: detections with a lower score are left out; their frames stay.
 
     Raises:
@@ -53,11 +55,11 @@ def read_detections(path: str | Path, *, min_score: float | None = None) -> Dete
         ConfigError: `min_score` without scores.
     """
     warnings: list[str] = []
-    table = read_columns(path, warnings)
+    table = read_columns(source, warnings)
     looks = _appearance_columns(table)
     table.expect(_REQUIRED, (*_OPTIONAL, *looks))
     if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row per detection")
+        raise InputError("has no rows below its header", path=path_of(source), hint="one row per detection")
     stamp_s = table.numbers(STAMP_S)
     position = np.stack([table.numbers(quantity) for quantity in POSITION], axis=1)
     given = ~np.isnan(position)
@@ -70,7 +72,7 @@ def read_detections(path: str | Path, *, min_score: float | None = None) -> Dete
     strong = kept & _strong(table, min_score)
     if not strong.any():
         hint = "a row with a position" if not kept.any() else "a lower `min_score`"
-        raise InputError("contains no detection", path=path, field="x_m", hint=hint)
+        raise InputError("contains no detection", path=path_of(source), field="x_m", hint=hint)
     frames, frame = np.unique(stamp_s, return_inverse=True)
     rows = np.flatnonzero(strong)
     rows = rows[np.argsort(frame[rows], kind="stable")]
@@ -85,7 +87,7 @@ def read_detections(path: str | Path, *, min_score: float | None = None) -> Dete
         appearance=_appearances(table, looks, rows),
         sensor_m=_sensor(table, frame, len(frames)),
         line=table.line[rows],
-        source=str(path),
+        source="" if isinstance(source, DataFrame) else str(source),
         box=_boxes(table, rows),
         score=table.numbers(SCORE)[rows] if SCORE.name in table else None,
         n_weak=int((kept & ~strong).sum()),

@@ -280,7 +280,7 @@ def in_world(table: DetectionTable, poses: Poses) -> DetectionTable:
     """
     if table.sensor_m is not None:
         hint = "no columns sensor_x_m, sensor_y_m, sensor_z_m beside `odometry`"
-        raise InputError("says where the sensor was", path=table.source, field="sensor_x_m", hint=hint)
+        raise InputError("says where the sensor was", path=table.source or None, field="sensor_x_m", hint=hint)
     counts, stamp_s = np.diff(table.first), table.stamp_s
     stamp_s, counts = with_empty_frames(stamp_s, counts, poses.stamp_s)
     pose = poses.at(stamp_s)

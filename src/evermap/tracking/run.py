@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.config import DEFAULT_PRIOR, TrackConfig
+from evermap.config import TrackConfig
 from evermap.errors import ConfigError, DataError, InputError
 from evermap.existence.models import priors_of
+from evermap.io.columns import TableSource
 from evermap.io.text import counted, quote
 from evermap.show import Shown, draw
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
+from evermap.tracking.detections import read_detections
 from evermap.tracking.field_of_view import find_field_of_view
 from evermap.tracking.frame import DetectionTable, p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
@@ -26,7 +28,7 @@ from evermap.tracking.state_file import State, read_state
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.tracking.views import View
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.types import DEFAULT_PRIOR, UNKNOWN, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -134,7 +136,7 @@ def check_choices(config: TrackConfig, table: DetectionTable) -> None:
 
 
 def run_track(
-    table: DetectionTable,
+    detections: DetectionTable | TableSource,
     config: TrackConfig | None = None,
     *,
     confusion: FloatArray | None = None,
@@ -144,7 +146,7 @@ def run_track(
     """Track all frames of a table.
 
     Args:
-        table: of `read_detections`.
+        detections: of `read_detections`, or what that takes: a data frame, or a file.
         config: the choices.
         confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
         tracker: of `make_tracker`, which goes on where it was and is changed; a new one where None. The spells and
@@ -153,9 +155,13 @@ def run_track(
 
     Raises:
         ConfigError: choices that do not fit the table.
+        InputError: as of `read_detections`.
         DataError: nothing was seen often enough to be an object.
     """
     config = config or TrackConfig()
+    table = detections
+    if not isinstance(table, DetectionTable):
+        table = read_detections(table, min_score=config.min_score)
     check_choices(config, table)
     if tracker is None:
         tracker = make_tracker(table, config, confusion=confusion)
@@ -168,7 +174,9 @@ def run_track(
         if _usual_step_s(table) > config.slow_step_s:
             hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
         raise DataError(
-            "no object was seen often enough to be distinguished from false alarms", path=table.source, hint=hint
+            "no object was seen often enough to be distinguished from false alarms",
+            path=table.source or None,
+            hint=hint,
         )
     confirmed = np.isin(track_of_detection, tracks.track_id[tracks.state != TrackState.BIRTH])
     track_of_detection = np.where(confirmed, track_of_detection, UNKNOWN)
@@ -269,7 +277,7 @@ def make_tracker(
 
 def _check_goes_on(table: DetectionTable, saved: State) -> None:
     """Raise an InputError unless a tracker may go on with a table: of the same kind, after its last frame."""
-    path, kind = Path(table.source), _kind_of(table)
+    path, kind = table.source or None, _kind_of(table)
     if saved.kind != kind:
         problem = f"detections {_in_words(kind)}, and those of the state are {_in_words(saved.kind)}"
         raise InputError(problem, path=path, hint="another --state")
@@ -294,7 +302,7 @@ def _with_classes(table: DetectionTable, names: tuple[str, ...]) -> DetectionTab
     if table.class_names == names:
         return table
     if missing := [name for name in table.class_names if name not in names]:
-        raise InputError(f"class {quote(missing[0])} is unknown to the tracker", path=Path(table.source))
+        raise InputError(f"class {quote(missing[0])} is unknown to the tracker", path=table.source or None)
     into = np.array([names.index(name) for name in table.class_names], dtype=np.int64)
     class_id = np.where(table.class_id == UNKNOWN, UNKNOWN, into[table.class_id])
     return replace(table, class_names=names, class_id=class_id)

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from evermap.existence.protocol import Instants
 from evermap.geometry import se3
 from evermap.geometry.group import group_of
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
+    Clock,
     Detections,
     FloatArray,
     Frames,
@@ -26,6 +28,7 @@ from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival  # noqa: 
 from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import draw_map, moving_paths
 from evermap.viz.panels import corners_of, height_over_width, lay_out
+from evermap.viz.presence_figures import plot_raster
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -260,3 +263,32 @@ def _draw_bars(axes: Axes, rests: Any, colours: Sequence[str], axis: TimeAxis, e
     axes.axvline(at(end_s), color=INK, lw=0.6, ls=":", label="last frame")
     axis.label(axes)
     axes.set_title(f"{which} at rest")
+
+
+_BINS = 480
+"""Times of a figure of beliefs."""
+
+
+def plot_persist_run(result: Any, clock: Clock | None = None) -> Figure:
+    """Draw a `PersistResult`: beliefs over time, a row a feature, of those that changed most.
+
+    Args:
+        result: of `run_persist`.
+        clock: what its stamps count; None for what the table says, or a guess.
+    """
+    features = result.most_changed()
+    start_s, stop_s, _, last_look_s = result.table.span
+    edge_s = np.linspace(start_s, max(stop_s, float(result.forecasts.stamp_s[-1])), _BINS + 1)
+    looks, _ = result.looks.at(features)
+    middle_s = 0.5 * (edge_s[1:] + edge_s[:-1])
+    track = result.models.only(features).track(looks, Instants.same_for_all(len(features), middle_s))
+    row = {feature: k for k, feature in enumerate(features.tolist())}
+    columns = (getattr(result.changes, name).tolist() for name in ("feature", "stamp_s", "returned"))
+    return plot_raster(
+        [result.table.names[feature] for feature in features.tolist()],
+        edge_s,
+        track.p_present.reshape(len(features), -1),
+        changes=[(row[of], stamp_s, back) for of, stamp_s, back in zip(*columns, strict=True) if of in row],
+        forecast_from_s=last_look_s,
+        clock=clock or result.table.clock or guess_clock(result.table.stamp_s),
+    )

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from evermap.config import DEFAULT_PRIOR, TrackConfig
+from evermap.config import TrackConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.models import NamedModels, save_models
 from evermap.existence.one_stay import OneStay
 from evermap.survival import Exponential, GeneralPurpose
 from evermap.survival.text import parse_prior
 from evermap.tracking.run import _priors
+from evermap.types import DEFAULT_PRIOR
 
 NAMES = ("cart", "pallet")
 CART, PALLET = parse_prior("weibull:scale=1h,shape=1.5"), Exponential(1e-4)

@@ -18,6 +18,7 @@ from evermap.existence.protocol import Looks, PresenceModel
 from evermap.existence.run_length import RunLength
 from evermap.runs.persist.models import ModelOfEach
 from evermap.runs.persist.table import Span
+from evermap.show import Shown, ShownTable
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _SHORTEST_GAP_S = 1e-9
@@ -26,8 +27,8 @@ _CERTAIN = 700.0
 """Log odds that a double still tells from certainty."""
 
 
-@dataclass(frozen=True, slots=True)
-class Changes:
+@dataclass(frozen=True, slots=True, repr=False)
+class Changes(ShownTable):
     """C changes in the order in which they were decided.
 
     Attributes:
@@ -53,6 +54,21 @@ class Changes:
     def per_feature(self, n_features: int) -> IntArray:
         """Return (F,) number of changes of each feature."""
         return np.bincount(self.feature, minlength=n_features)
+
+
+MOST_FEATURES = 60
+"""Rows of a figure of all features, at most."""
+
+
+def most_changed(changes: IntArray, looks: IntArray, n: int) -> IntArray:
+    """Return the `n` features that changed most, of equals those looked at more often; in natural order.
+
+    Args:
+        changes: (F,) number of changes of each.
+        looks: (F,) number of looks at each.
+        n: how many.
+    """
+    return np.sort(np.lexsort((-looks, -changes))[:n])
 
 
 def find_changes(looks: Looks, p_present: FloatArray, confidence: float, tail: float = 0.025) -> Changes:
@@ -143,8 +159,8 @@ MOST_STEPS = 10_000
 """More steps of a forecast than this are a mistake."""
 
 
-@dataclass(frozen=True, slots=True)
-class Forecasts:
+@dataclass(frozen=True, slots=True, repr=False)
+class Forecasts(Shown):
     """Presence of F features at N instants from the latest look on.
 
     Attributes:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from evermap.existence.protocol import Instants
+from evermap.runs.persist.changes import MOST_FEATURES
 from evermap.runs.persist.run import PersistResult
 from evermap.survival.durations import duration_text
 from evermap.types import Clock, FloatArray, IntArray, stamp_text
@@ -119,8 +120,6 @@ def _forecasts(result: PersistResult) -> str:
     return f"<h2>Forecasts</h2>{table(head, rows, numbers=range(1, len(head)))}{note}"
 
 
-RASTER_ROWS = 60
-_RASTER_COLUMNS = 480
 _CURVE_POINTS = 400
 _PIXELS = 1200
 """Columns of a figure: with more looks, each column shows the lowest and the highest belief, and one tick per kind."""
@@ -132,44 +131,16 @@ def draw_run(result: PersistResult, clock: Clock) -> Iterator[NamedFigure]:
     if result.scores is not None and result.reliability is not None:
         yield _calibration(result)
     taken: set[str] = set()
-    for feature in most_interesting(result, result.config.figures).tolist():
+    for feature in result.most_changed(result.config.figures).tolist():
         yield _feature(result, feature, clock, taken)
 
 
-def most_interesting(result: PersistResult, n: int) -> IntArray:
-    """Return the `n` features that changed most, of equals those looked at more often; in natural order."""
-    return most_changed(result.changes.per_feature(result.table.n_features), np.diff(result.looks.first), n)
-
-
-def most_changed(changes: IntArray, looks: IntArray, n: int) -> IntArray:
-    """Return `most_interesting` by the changes and the looks of each feature."""
-    return np.sort(np.lexsort((-looks, -changes))[:n])
-
-
 def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
-    from evermap.viz.presence_figures import plot_raster
+    from evermap.viz.plots import plot_persist_run
 
-    features = most_interesting(result, RASTER_ROWS)
-    start_s, end_s = _span(result)
-    edge_s = np.linspace(start_s, end_s, _RASTER_COLUMNS + 1)
-    middle_s = 0.5 * (edge_s[1:] + edge_s[:-1])
-    looks, _ = result.looks.at(features)
-    track = result.models.only(features).track(looks, Instants.same_for_all(len(features), middle_s))
-    row = {feature: k for k, feature in enumerate(features.tolist())}
-    changes = result.changes
-    columns = (changes.feature.tolist(), changes.stamp_s.tolist(), changes.returned.tolist())
-    marks = [(row[of], stamp_s, returned) for of, stamp_s, returned in zip(*columns, strict=True) if of in row]
-    names = [result.table.names[feature] for feature in features.tolist()]
-    figure = plot_raster(
-        names,
-        edge_s,
-        track.p_present.reshape(len(features), -1),
-        changes=marks,
-        forecast_from_s=result.table.span.last_look_s,
-        clock=clock,
-    )
-    total = len(result.totals.p_now)
-    which = "All features" if len(features) == total else f"The {len(features)} of {total:,} features that changed most"
+    figure = plot_persist_run(result, clock)
+    total, shown = len(result.totals.p_now), min(MOST_FEATURES, result.table.n_features)
+    which = "All features" if shown == total else f"The {shown} of {total:,} features that changed most"
     caption = f"{which}: blue is there, orange is not, pale is undecided, hatched is not yet seen."
     return NamedFigure("overview", figure, "Beliefs of all features", caption)
 

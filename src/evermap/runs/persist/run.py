@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -13,23 +13,43 @@ from evermap.config import PersistConfig
 from evermap.errors import ConfigError, DataError, InputError, NumericalError
 from evermap.existence.one_stay import OneStay
 from evermap.existence.protocol import Looks
+from evermap.io.columns import TableSource
 from evermap.io.text import counted, quote
 from evermap.metrics.belief import BeliefScores, Reliability, belief_scores, reliability
-from evermap.runs.persist.changes import Changes, Forecasts, find_changes, forecast_stamps, forecasts_of
+from evermap.runs.persist.changes import (
+    MOST_FEATURES,
+    Changes,
+    Forecasts,
+    find_changes,
+    forecast_stamps,
+    forecasts_of,
+    most_changed,
+)
 from evermap.runs.persist.models import ModelOfEach, ask, models_for
-from evermap.runs.persist.table import LookTable, Truth
-from evermap.types import FloatArray, IntArray, Progress
+from evermap.runs.persist.table import LookTable, Truth, are_numbers, read_looks
+from evermap.show import Shown, ShownTable, data_frame, draw
+from evermap.types import ChangeKind, FloatArray, IntArray, Progress
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from evermap.runs.persist.models import LearnedModels
 
 
+_CHANGE = ("stamp_s", "earliest_s", "latest_s", "decided_s", "confidence")
+BELIEF = ("stamp_s", "feature_id", "p_exists")
+OUTLOOK = ("median_stay_s", "mean_stay_s", "mean_absence_s")
+"""Columns of beliefs, and what those of forecasts have beside them."""
 MOST_ROWS = 100_000_000
 """Number of beliefs above which the step is considered a mistake."""
 
 
-@dataclass(frozen=True, slots=True)
-class Beliefs:
+Part = Literal["beliefs", "changes", "forecasts"]
+"""Tables of a result."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Beliefs(ShownTable):
     """B beliefs: in the order of the table, or by feature and time on a grid.
 
     Attributes:
@@ -127,8 +147,8 @@ class Totals:
         return cls(**values)
 
 
-@dataclass(frozen=True, slots=True)
-class PersistResult:
+@dataclass(frozen=True, slots=True, repr=False)
+class PersistResult(Shown):
     """All results of a run.
 
     Attributes:
@@ -164,9 +184,65 @@ class PersistResult:
     step_s: dict[str, float]
     warnings: tuple[str, ...]
 
+    def to_pandas(self, part: Part = "beliefs") -> Any:
+        """Return a data frame with the ids of the features: a row a belief, a change, or an instant of a forecast.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        names = self.table.names
+        ids = np.array([int(name) for name in names] if are_numbers(names) else names, dtype=object)
+        return data_frame(self.columns_of(part, ids.__getitem__)).infer_objects()
+
+    def columns_of(self, part: Part, name: Callable[[IntArray], Any]) -> dict[str, Any]:
+        """Return the columns of a table, as `Beliefs`, `Changes` and `Forecasts` have them, in rows.
+
+        What is expected from now on is in the first row of each feature's forecast. `name` makes the column
+        `feature_id` of indices of features.
+        """
+        if part == "beliefs":
+            found = self.beliefs
+            return dict(zip(BELIEF, (found.stamp_s, name(found.feature), found.p_exists), strict=True))
+        if part == "changes":
+            changes = self.changes
+            kind = np.where(changes.returned, ChangeKind.RETURNED.value, ChangeKind.VANISHED.value).astype(object)
+            when = {column: getattr(changes, column) for column in _CHANGE}
+            return {"feature_id": name(changes.feature), "kind": kind, **when}
+        ahead = self.forecasts
+        features, steps = ahead.p_exists.shape
+        cells = np.tile(ahead.stamp_s, features), name(np.repeat(np.arange(features), steps)), ahead.p_exists.ravel()
+        columns = dict(zip(BELIEF, cells, strict=True))
+        for outlook in OUTLOOK:
+            expected = np.full((features, steps), np.nan)
+            expected[:, 0] = getattr(ahead, outlook)
+            columns[outlook] = expected.ravel()
+        return columns
+
+    def plot(self) -> Figure:
+        """Draw the beliefs over time, a row a feature, of the 60 that changed most; returns a matplotlib figure."""
+        return draw("plot_persist_run", self)
+
+    def most_changed(self, n: int = MOST_FEATURES) -> IntArray:
+        """Return the indices of the `n` features that changed most, of equals those looked at more often."""
+        return most_changed(self.changes.per_feature(self.table.n_features), np.diff(self.looks.first), n)
+
+    def _facts(self) -> dict[str, Any]:
+        span = self.table.span
+        return {
+            "source": self.table.source,
+            "features": self.table.n_features,
+            "looks": self.totals.looks,
+            "from_s": round(span.start_s, 3),
+            "to_s": round(span.stop_s, 3),
+            "vanished": self.totals.vanished,
+            "returned": self.totals.returned,
+            "expected_present_now": round(float(np.nansum(self.totals.p_now)), 2),
+            "warnings": self.warnings,
+        }
+
 
 def run_persist(
-    table: LookTable,
+    looks: LookTable | TableSource,
     config: PersistConfig | None = None,
     *,
     truth: Truth | None = None,
@@ -175,39 +251,40 @@ def run_persist(
     """Compute beliefs, changes and forecasts of a table of looks.
 
     Args:
-        table: `read_looks(path)`.
+        looks: of `read_looks`, or what that takes: a data frame, or a file.
         config: choices; the defaults where None.
         truth: what truly was there, for scores and figures only; None takes the column `present` of the table.
         progress: told after each step.
 
     Raises:
         ConfigError: choices that cannot be.
-        InputError: a look that is impossible, whether the feature was there or not.
+        InputError: as of `read_looks`; a look that is impossible, whether the feature was there or not.
         DataError: looks from which no model can be learned.
     """
     config = config or PersistConfig()
+    table = looks if isinstance(looks, LookTable) else read_looks(looks, p_miss=config.p_miss, p_false=config.p_false)
     clock = _Steps(("sort", "learn", "filter", "changes", "score"), progress)
     order = table.order()
-    looks = table.looks(order)
+    ordered = table.looks(order)
     clock.done("sort")
     try:
-        models, learned = models_for(config, table, looks, clock.within)
+        models, learned = models_for(config, table, ordered, clock.within)
         clock.done("learn")
-        beliefs, p_at_looks, forecasts, merged_mass = _filter(table, order, config, models, looks)
+        beliefs, p_at_looks, forecasts, merged_mass = _filter(table, order, config, models, ordered)
     except NumericalError as error:
         raise _named(error, table, order) from error
     except DataError as error:
         raise DataError(error.problem, path=table.source or None, hint=error.hint) from error
     clock.done("filter")
-    changes = find_changes(looks, p_at_looks, config.confidence, config.tail)
+    changes = find_changes(ordered, p_at_looks, config.confidence, config.tail)
     clock.done("changes")
     at_rows = table.present if truth is None and config.query == "times" else None
     truth = truth or table.truth(order)
     scores, bins = _score(table, beliefs, truth, at_rows)
     clock.done("score")
-    totals = Totals.of(table, looks, beliefs, changes, forecasts, merged_mass)
+    totals = Totals.of(table, ordered, beliefs, changes, forecasts, merged_mass)
     return PersistResult(
-        table, config, models, learned, looks, p_at_looks, beliefs, changes, forecasts, truth, scores, bins,
+        table, config, models, learned, ordered, p_at_looks, beliefs, changes, forecasts, truth, scores, bins,
         totals, clock.step_s, (*table.warnings, *remarks(config, models, totals)),
     )  # fmt: skip
 

@@ -13,9 +13,10 @@ import numpy as np
 from evermap.config import PersistConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.protocol import Looks, feature_of, firsts_of
-from evermap.io.columns import Columns, natural_order, parquet_batches, read_columns
+from evermap.io.columns import Columns, DataFrame, TableSource, natural_order, parquet_batches, path_of, read_columns
 from evermap.io.table import arrow_cells, pa, pq
 from evermap.io.text import counted, quote
+from evermap.show import Shown
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import STAMP_S, Quantity
 
@@ -35,8 +36,8 @@ class Span(NamedTuple):
     last_look_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class LookTable:
+@dataclass(frozen=True, slots=True, repr=False)
+class LookTable(Shown):
     """R rows of a table, in its order; a row without a look only asks for the belief at its time.
 
     Attributes:
@@ -194,11 +195,11 @@ class Truth:
         return answer
 
 
-def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -> LookTable:
+def read_looks(source: TableSource, *, p_miss: float = 0.1, p_false: float = 0.1) -> LookTable:
     """Return a table with `stamp_s, feature_id, detected` and perhaps `p_miss, p_false, class_id, present`.
 
     Args:
-        path: a `.csv`, `.csv.gz` or `.parquet` file, or a folder of the latter; rows in any order.
+        source: a `.csv`, `.csv.gz` or `.parquet` file, a folder of the latter, or a data frame; rows in any order.
         p_miss: `P(no detection | there)` where the table does not say.
         p_false: `P(detection | not there)` where the table does not say.
 
@@ -208,15 +209,20 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
     """
     _check_defaults(p_miss, p_false)
     warnings: list[str] = []
-    table = read_columns(path, warnings)
+    table = read_columns(source, warnings)
     _explain_missing(table)
     table.expect(_REQUIRED, _OPTIONAL)
     if len(table) == 0:
-        raise InputError("has no rows below its header", path=path, hint="one row per look")
+        raise InputError("has no rows below its header", path=path_of(source), hint="one row per look")
     found = _looks_of(table, p_miss, p_false)
     if np.isnan(found.detected).all():
-        raise _no_look(Path(path))
-    return replace(found, source=str(path), warnings=tuple(warnings))
+        raise _no_look(path_of(source))
+    return replace(found, source="" if isinstance(source, DataFrame) else str(source), warnings=tuple(warnings))
+
+
+def are_numbers(names: Sequence[str]) -> bool:
+    """Return whether all names are whole numbers, written as usual."""
+    return all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names)
 
 
 def _check_defaults(p_miss: float, p_false: float) -> None:
@@ -259,14 +265,14 @@ def _detected(table: Columns) -> FloatArray:
     return table.flags("detected", hint=_FLAG_HINT + ", empty where the sensor did not look")
 
 
-def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ...]]:
+def read_truth(source: TableSource, looks: LookTable) -> tuple[Truth, tuple[str, ...]]:
     """Return a table with `stamp_s, feature_id, present` about the features of `looks`, and remarks about others.
 
     Raises:
         InputError: anything wrong in the file, or no feature in common.
     """
     warnings: list[str] = []
-    table = read_columns(path, warnings)
+    table = read_columns(source, warnings)
     table.expect(("stamp_s", "feature_id", "present"), ("detected", "p_miss", "p_false", "class_id"))
     names, feature = _features(table)
     present = table.flags("present", hint=_FLAG_HINT + ", empty where unknown")
@@ -276,9 +282,9 @@ def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ..
     strangers = int((ours == UNKNOWN).sum())
     if strangers == len(names):
         problem = f"contains none of the features of {looks.source or 'the looks'}"
-        raise InputError(problem, path=path, field="feature_id", hint=f"such as {quote(looks.names[0])}")
+        raise InputError(problem, path=path_of(source), field="feature_id", hint=f"such as {quote(looks.names[0])}")
     if strangers:
-        warnings.append(f"{Path(path).name}: {counted(strangers, 'feature')} without looks ignored")
+        warnings.append(f"{path_of(source).name}: {counted(strangers, 'feature')} without looks ignored")
     rows = np.flatnonzero((ours[feature] != UNKNOWN) & ~np.isnan(present))
     rows = rows[np.lexsort((stamp_s[rows], ours[feature[rows]]))]
     truth = Truth(firsts_of(ours[feature[rows]], looks.n_features), stamp_s[rows], present[rows])

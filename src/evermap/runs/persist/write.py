@@ -23,6 +23,7 @@ from evermap.io.columns import csv_bytes, named, needs_quotes
 from evermap.io.table import arrow_cells
 from evermap.metrics.belief import Reliability
 from evermap.runs.folder import RunFolder
+from evermap.runs.persist.changes import MOST_FEATURES, most_changed
 from evermap.runs.persist.models import (
     LearnedModels,
     drawn_features,
@@ -31,9 +32,9 @@ from evermap.runs.persist.models import (
     learn_models,
     save_models,
 )
-from evermap.runs.persist.report import MOST_ROWS, RASTER_ROWS, draw_run, most_changed, render_report
-from evermap.runs.persist.run import PersistResult, Totals, remarks, run_persist
-from evermap.runs.persist.table import PartedLooks
+from evermap.runs.persist.report import MOST_ROWS, draw_run, render_report
+from evermap.runs.persist.run import BELIEF, OUTLOOK, Part, PersistResult, Totals, remarks, run_persist
+from evermap.runs.persist.table import PartedLooks, are_numbers
 from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
 from evermap.types import ChangeKind, Clock, FloatArray, IntArray, MapChange, json_number, landmark_id_of
 from evermap.viz.style import NamedFigure, save_png, save_svg
@@ -60,9 +61,9 @@ def write_persist(
     """
     with RunFolder(out, force=force, inputs=(result.table.source, *inputs)) as folder:
         start = perf_counter()
-        folder.path("beliefs.csv").write_bytes(_beliefs(result))
-        folder.path("forecasts.csv").write_bytes(_forecasts(result))
-        folder.path("changes.jsonl").write_text(_changes(result, _numbered(result.table.names)), encoding="utf-8")
+        folder.path("beliefs.csv").write_bytes(_table(result, "beliefs"))
+        folder.path("forecasts.csv").write_bytes(_table(result, "forecasts"))
+        folder.path("changes.jsonl").write_text(_changes(result, are_numbers(result.table.names)), encoding="utf-8")
         if result.learned is not None:
             save_models(result.models, result.learned.per, folder.path("model.json"))
         timing = {f"{name}_s": seconds for name, seconds in result.step_s.items()}
@@ -123,7 +124,7 @@ def persist_in_parts(
         scratch = Path(name)
         parted = PartedLooks.split(Path(path), scratch, config)
         learned, with_model = _learned(folder, parted, config)
-        quoted, numbered = needs_quotes(arrow_cells(list(parted.names))), _numbered(parted.names)
+        quoted, numbered = needs_quotes(arrow_cells(list(parted.names))), are_numbers(parted.names)
         work = partial(
             _worked_on, parted=parted.alone(), config=with_model, quoted=quoted, numbered=numbered, folder=scratch
         )
@@ -160,8 +161,8 @@ def _worked_on(
         for name, column in columns.items():
             np.save(folder / f"{name}-{number}.npy", column)
     else:
-        (folder / f"beliefs-{number}").write_bytes(_beliefs(result, quoted=quoted, header=False))
-    (folder / f"forecasts-{number}").write_bytes(_forecasts(result, quoted=quoted, header=False))
+        (folder / f"beliefs-{number}").write_bytes(_table(result, "beliefs", quoted=quoted, header=False))
+    (folder / f"forecasts-{number}").write_bytes(_table(result, "forecasts", quoted=quoted, header=False))
     (folder / f"changes-{number}").write_text(_changes(result, numbered), encoding="utf-8")
     latest = np.array([changes.decided_s, changes.stamp_s, changes.feature + first])[:, -MOST_ROWS:]
     return _Part(result.totals, changes.per_feature(table.n_features), latest)
@@ -191,7 +192,7 @@ def _join(folder: RunFolder, scratch: Path, parted: PartedLooks, config: Persist
     numbers = range(len(parted.files))
     for name in ("forecasts",) if config.query == "times" else ("forecasts", "beliefs"):
         with folder.path(f"{name}.csv").open("wb") as file:
-            file.write((",".join(_BELIEFS if name == "beliefs" else (*_BELIEFS, *_OUTLOOK)) + "\n").encode())
+            file.write((",".join(BELIEF if name == "beliefs" else (*BELIEF, *OUTLOOK)) + "\n").encode())
             for number in numbers:
                 with (scratch / f"{name}-{number}").open("rb") as piece:
                     shutil.copyfileobj(piece, file)
@@ -220,14 +221,14 @@ def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> 
                 a, b = np.searchsorted(row, (start, start + size))
                 for into, column in zip((stamp_s, p, feature), columns, strict=True):
                     into[row[a:b] - start] = column[a:b]
-            cells = dict(zip(_BELIEFS, (stamp_s, names.take(arrow_cells(feature)), p), strict=True))
+            cells = dict(zip(BELIEF, (stamp_s, names.take(arrow_cells(feature)), p), strict=True))
             file.write(csv_bytes(cells, quoted=quoted, header=start == 0))
 
 
 def _shown(parted: PartedLooks, done: Sequence[_Part], totals: Totals, config: PersistConfig) -> IntArray:
     """The features of which figures and report tell."""
     changes = np.concatenate([part.changes for part in done])
-    changed = most_changed(changes, parted.looks, max(RASTER_ROWS, config.figures))
+    changed = most_changed(changes, parted.looks, max(MOST_FEATURES, config.figures))
     decided_s, stamp_s, feature = np.concatenate([part.latest for part in done], axis=1)
     latest = feature[np.lexsort((feature, stamp_s, decided_s))][-MOST_ROWS:].astype(np.int64)
     return np.unique(np.concatenate([changed, latest, np.flatnonzero(~np.isnan(totals.p_now))[:MOST_ROWS]]))
@@ -264,34 +265,12 @@ def persist_summary(result: PersistResult, *, info: RunInfo, timing: dict[str, f
     }
 
 
-_BELIEFS = ("stamp_s", "feature_id", "p_exists")
-_OUTLOOK = ("median_stay_s", "mean_stay_s", "mean_absence_s")
 _ROWS = 1 << 18
 """That are written at a time."""
 
 
-def _beliefs(result: PersistResult, **how: bool) -> bytes:
-    beliefs = result.beliefs
-    cells = beliefs.stamp_s, named(result.table.names, beliefs.feature), beliefs.p_exists
-    return csv_bytes(dict(zip(_BELIEFS, cells, strict=True)), **how)
-
-
-def _forecasts(result: PersistResult, **how: bool) -> bytes:
-    """By feature and time; what is expected from now on stands where the forecast begins."""
-    stamp_s, p_exists = result.forecasts.stamp_s, result.forecasts.p_exists
-    features, steps = p_exists.shape
-    names = named(result.table.names, np.repeat(np.arange(features), steps))
-    columns = dict(zip(_BELIEFS, (np.tile(stamp_s, features), names, p_exists.ravel()), strict=True))
-    for name in _OUTLOOK:
-        column = np.full((features, steps), np.nan)
-        column[:, 0] = getattr(result.forecasts, name)
-        columns[name] = column.ravel()
-    return csv_bytes(columns, **how)
-
-
-def _numbered(names: Sequence[str]) -> bool:
-    """Whether all features are called by whole numbers."""
-    return all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names)
+def _table(result: PersistResult, part: Part, **how: bool) -> bytes:
+    return csv_bytes(result.columns_of(part, partial(named, result.table.names)), **how)
 
 
 def _changes(result: PersistResult, numbers: bool) -> str:
