@@ -2,6 +2,8 @@
 #   make demo    set up and run the demonstration       make test    set up and run the tests
 #   make lint    style, formatting, types, security     make docs-check    run the commands of the documents
 #   make docs    set up and build the documentation as a site, into out/site
+#   make test-fast PART=maps    the quick tests of one folder of tests/, or of one file
+#   make mutants PART=maps      do the tests of a part notice 200 small changes? about an hour
 #   make bench   compare with the committed baseline    make clean   remove what make made
 #   make browser    a Chromium, for the tests of the server's page, which are skipped without one
 #   make experiments    whole experiments, most on the recordings in ../shared/data, minutes long
@@ -24,10 +26,10 @@ DEVELOPMENT = $(VENV)/.stamp-development
 DOCUMENTATION = $(VENV)/.stamp-documentation
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo browser test test-slow test-all experiments results lint audit format docs docs-check bench lock clean
+.PHONY: help setup setup-dev demo browser test test-fast mutants test-slow test-all experiments results lint audit format docs docs-check bench lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 9
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 11
 
 setup: $(RUNTIME)
 setup-dev: $(DEVELOPMENT)
@@ -37,6 +39,13 @@ demo: $(RUNTIME)
 
 test: $(DEVELOPMENT)
 	$(PYTEST)
+
+PART ?= maps
+test-fast: $(DEVELOPMENT)
+	$(PYTEST) tests/$(PART:tests/%=%)
+
+mutants: $(DEVELOPMENT)
+	$(VENV)/bin/python -m benchmarks.mutants $(PART)
 
 # A browser and axe-core, for tests/server/test_page.py; where we may not install one, it says how.
 browser: $(DEVELOPMENT)
