@@ -513,8 +513,8 @@ def test_uploads_are_a_table_with_their_verdicts(site: Site, browser: Browser) -
     assert [(row[0], row[1], row[3], row[4]) for row in rows] == [
         (str(job["id"]), job["robot"], f"✓ entered, revision {job['revision']}", "sound") for job in jobs
     ]
-    assert [row[5] for row in rows] == [job["remarks"] for job in jobs]
-    refused = {**jobs[0], "state": "aside", "verdict": "lost", "remarks": HOSTILE, "revision": 3}
+    assert [row[5] for row in rows] == [job["reason"] or "–" for job in jobs]
+    refused = {**jobs[0], "state": "aside", "verdict": "lost", "reason": HOSTILE, "revision": 3}
     browser.value(f"tableOfJobs([{json.dumps(refused)}])")
     assert browser.text("#jobs tbody td:nth-child(4)") == "△ set aside"
     assert browser.text("#jobs tbody td:nth-child(6)") == HOSTILE

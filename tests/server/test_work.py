@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -105,6 +106,24 @@ def test_a_worker_killed_after_the_commit_enters_nothing_twice(fleet: Fleet, zip
     assert fleet("GET", "/maps").json()[0]["head"] == 1
     fleet.server.database.finish(number, "killed", JobState.REJECTED, "too late")
     assert fleet("GET", f"/jobs/{number}").json()["state"] == "entered"
+
+
+def test_the_verdicts_of_an_older_server_get_their_column(tmp_path: Path) -> None:
+    """They were the beginnings of reasons; what is no verdict stays whole, and another opening changes nothing."""
+    Database(tmp_path)
+    reasons = {"sound": ("sound", ""), "sound, 2 rows left out": ("sound", "2 rows left out"),
+               "sensor suspect: the camera is late": ("sensor suspect", "the camera is late"),
+               "3 workers crashed on it": ("", "3 workers crashed on it"), "": ("", "")}  # fmt: skip
+    with sqlite3.connect(tmp_path / "server.db") as older:
+        older.execute("ALTER TABLE job DROP COLUMN verdict")
+        older.execute("UPDATE server SET version = 1")
+        for number, reason in enumerate(reasons):
+            row = ("ward", str(number), 1, "cart", "entered", reason, 0, "", 0.0, "", "")
+            names = "site, digest, n_bytes, robot, state, reason, tries, worker, lease_s, created_at, changed_at"
+            older.execute(f"INSERT INTO job ({names}) VALUES ({', '.join('?' * len(row))})", row)
+    for _ in range(2):
+        jobs = Database(tmp_path).jobs()[::-1]
+        assert [(job.verdict, job.reason) for job in jobs] == list(reasons.values())
 
 
 @pytest.mark.parametrize("where", ["sqlite"], indirect=True)

@@ -356,11 +356,10 @@ def work(
         became = outcome.state.value if outcome.revision is None else f"revision {outcome.revision}"
         if as_json:
             of = {"job": job.id, "site": job.site, "robot": job.robot, "state": outcome.state.value}
-            typer.echo(json.dumps({**of, "revision": outcome.revision, "reason": outcome.reason}))
-        say(
-            f"session {job.id} of {job.robot} for {job.site}: {became}"
-            + (f" ({outcome.reason})" if outcome.reason else "")
-        )
+            said = {"revision": outcome.revision, "verdict": outcome.verdict, "reason": outcome.reason}
+            typer.echo(json.dumps({**of, **said}))
+        why = f" ({outcome.text})" if outcome.text else ""
+        say(f"session {job.id} of {job.robot} for {job.site}: {became}{why}")
 
     warm_up()
     Worker(database, SiteStores(store), chosen, lease_s).run(told, drain=drain)

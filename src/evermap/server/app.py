@@ -42,7 +42,7 @@ from evermap.runs.summary import change_dict
 from evermap.server.database import AWAY, Database, Job, JobState, Role
 from evermap.server.sites import NoSuchSiteError, SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest
-from evermap.types import Landmarks, VerdictKind, json_number
+from evermap.types import Landmarks, json_number
 
 _EVERY_S = 1.0
 """Between two looks for new revisions, where none are announced."""
@@ -401,7 +401,7 @@ async def upload(request: Request, response: Response, site: Site, server: Answe
         digest = await run_in_threadpool(checked_digest, data, server.limits)
     job, fresh = await run_in_threadpool(server.database.enqueue, site, digest, data, who)
     response.status_code = 202 if fresh else 200
-    return _job_dict(job)
+    return asdict(job)
 
 
 @router.get("/jobs")
@@ -409,13 +409,13 @@ def list_jobs(
     server: Answering, _: Reader, site: OfSite = None, state: JobState | None = None, most: Most = 100
 ) -> list[dict[str, Any]]:
     """List uploaded sessions, the newest first."""
-    return [_job_dict(job) for job in server.database.jobs(site, state, most)]
+    return [asdict(job) for job in server.database.jobs(site, state, most)]
 
 
 @router.get("/jobs/{number}")
 def show_job(number: JobNumber, server: Answering, _: Reader) -> dict[str, Any]:
     """Return the state of an uploaded session."""
-    return _job_dict(_job(server, number))
+    return asdict(_job(server, number))
 
 
 @router.get("/jobs/{number}/payload", **_as("application/octet-stream"))
@@ -432,13 +432,7 @@ def retry(number: JobNumber, server: Answering, _: Approver) -> dict[str, Any]:
     """Queue a refused session once more."""
     if not server.database.retry(_job(server, number).id):
         raise HTTPException(409, "only a refused session can be queued again")
-    return _job_dict(_job(server, number))
-
-
-def _job_dict(job: Job) -> dict[str, Any]:
-    """Return a session with its verdict, '' before it has one, and what else its reason says."""
-    verdict = next((kind.value for kind in VerdictKind if job.reason.startswith(kind.value)), "")
-    return asdict(job) | {"verdict": verdict, "remarks": job.reason.removeprefix(verdict).lstrip(":, ")}
+    return asdict(_job(server, number))
 
 
 def _job(server: Server, number: int) -> Job:

@@ -29,9 +29,10 @@ from evermap.maps.store.postgres import engine_of as postgres_engine
 from evermap.maps.store.sql import announce, now_utc
 from evermap.maps.store.sqlite import engine_of as sqlite_engine
 from evermap.server.sites import store_place
+from evermap.types import VerdictKind
 
-VERSION = 1
-"""Schema version of the tables; there is no older one to migrate."""
+VERSION = 2
+"""Schema version of the tables; older ones are migrated (`_migrate`)."""
 SCHEMA = "evermap_server"
 AWAY = (OperationalError, InterfaceError)
 """Errors raised by a database that does not answer."""
@@ -70,6 +71,7 @@ _job = sa.Table(
     *_given(site=sa.Text, digest=sa.Text, n_bytes=sa.Integer, robot=sa.Text),
     sa.Column("state", sa.Text, nullable=False, index=True),
     sa.Column("reason", sa.Text, nullable=False, default=""),
+    sa.Column("verdict", sa.Text, nullable=False, server_default=""),
     sa.Column("revision", sa.Integer),
     sa.Column("tries", sa.Integer, nullable=False, default=0),
     sa.Column("worker", sa.Text, nullable=False, default=""),
@@ -88,6 +90,21 @@ _robot = sa.Table(
     "robot", metadata, sa.Column("name", sa.Text, primary_key=True), *_given(maps=sa.Text, told=sa.Integer, at=sa.Text)
 )
 _audit = sa.Table("audit", metadata, _numbered(), *_given(at=sa.Text, who=sa.Text, what=sa.Text, status=sa.Integer))
+
+
+def _migrate(connection: sa.Connection) -> int | None:
+    """Bring the tables of an older evermap to those of this one, and return the version that they have then."""
+    version = connection.execute(sa.select(_server.c.version).with_for_update()).scalar()
+    if version == 1:  # the verdict of a session was the beginning of its reason
+        job = f"{SCHEMA}.job" if connection.dialect.name == "postgresql" else "job"
+        connection.execute(sa.text(f"ALTER TABLE {job} ADD COLUMN verdict TEXT NOT NULL DEFAULT ''"))
+        for kind in VerdictKind:
+            mine = _job.c.reason.startswith(kind.value)
+            rest = sa.func.ltrim(sa.func.substr(_job.c.reason, len(kind.value) + 1), ":, ")
+            connection.execute(sa.update(_job).where(mine).values(verdict=kind.value, reason=rest))
+        connection.execute(sa.update(_server).values(version=VERSION))
+        return VERSION
+    return version
 
 
 class Role(IntEnum):
@@ -123,6 +140,7 @@ class Job:
         robot: name of the token that sent it.
         state: where it is.
         reason: why it was refused, or a remark.
+        verdict: how far its estimate can be trusted (`VerdictKind`), '' before it has one.
         revision: that it became, or of the map that it did not fit; None before.
         tries: workers that have begun it since it was queued.
         created_at, changed_at: ISO 8601, UTC.
@@ -135,6 +153,7 @@ class Job:
     robot: str
     state: JobState
     reason: str
+    verdict: str
     revision: int | None
     tries: int
     created_at: str
@@ -175,7 +194,7 @@ class Database:
             connection.execute(CreateIndex(_open_jobs, if_not_exists=True))
             if not begun:
                 connection.execute(sa.insert(_server).values(version=VERSION))
-            version = connection.execute(sa.select(_server.c.version)).scalar()
+            version = _migrate(connection)
         if version != VERSION:
             problem = f"the server's tables are of version {version}, this evermap has {VERSION}"
             raise InputError(problem, hint="the evermap version that wrote them, or an empty store")
@@ -270,9 +289,18 @@ class Database:
         with self._writer.begin() as connection:
             connection.execute(sa.update(_job).where(_mine(job, worker)).values(lease_s=time.time() + lease_s))
 
-    def finish(self, job: int, worker: str, state: JobState, reason: str = "", revision: int | None = None) -> None:
+    def finish(
+        self,
+        job: int,
+        worker: str,
+        state: JobState,
+        reason: str = "",
+        revision: int | None = None,
+        *,
+        verdict: str = "",
+    ) -> None:
         """Record the result of a session, unless another worker has its lease by now."""
-        values: dict[str, Any] = {"state": state.value, "revision": revision, "worker": ""}
+        values: dict[str, Any] = {"state": state.value, "revision": revision, "worker": "", "verdict": verdict}
         values["reason"] = printable(reason, 2000)
         if state is JobState.QUEUED:  # given back: that was no try
             values["tries"] = _job.c.tries - 1
@@ -289,7 +317,7 @@ class Database:
     def retry(self, job: int) -> bool:
         """Queue a session once more that was refused or set aside; returns whether it was one."""
         refused = sa.and_(_job.c.id == job, _job.c.state.in_([JobState.REJECTED.value, JobState.ASIDE.value]))
-        values = {"state": JobState.QUEUED.value, "reason": "", "tries": 0, "changed_at": now_utc()}
+        values = {"state": JobState.QUEUED.value, "reason": "", "verdict": "", "tries": 0, "changed_at": now_utc()}
         with self._writer.begin() as connection:
             site = connection.execute(sa.update(_job).where(refused).values(values).returning(_job.c.site)).scalar()
             if site is not None:

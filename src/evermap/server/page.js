@@ -535,7 +535,7 @@ function tableOfJobs(jobs) {
   $("uploads").textContent = jobs.length ? "" : "None yet.";
   const became = (job) => (job.state === "entered" && job.revision !== null ? `, revision ${job.revision}` : "");
   table("jobs", ["Session", "Robot", "Uploaded (UTC)", "State", "Verdict", "Remarks"], jobs.map((job) => [
-    String(job.id), job.robot, minute(job.created_at), `${STATES[job.state] ?? job.state}${became(job)}`, job.verdict || "–", job.remarks || "–"]));
+    String(job.id), job.robot, minute(job.created_at), `${STATES[job.state] ?? job.state}${became(job)}`, job.verdict || "–", job.reason || "–"]));
 }
 
 // Robots by the revision that they use, as they report, and where their newest sessions ended.

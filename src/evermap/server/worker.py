@@ -41,11 +41,18 @@ class JobOutcome:
             store did not answer.
         reason: why, or a remark.
         revision: that it is, or that it was tried with.
+        verdict: how far its estimate can be trusted, '' without an estimate.
     """
 
     state: JobState
     reason: str = ""
     revision: int | None = None
+    verdict: str = ""
+
+    @property
+    def text(self) -> str:
+        """Verdict and reason in one line; '' without both."""
+        return ": ".join(filter(None, (self.verdict, self.reason)))
 
 
 class Worker:
@@ -91,7 +98,9 @@ class Worker:
                 outcome = JobOutcome(JobState.REJECTED, f"{job.tries} workers crashed on it")
             else:
                 outcome = self._enter(job, data)
-        self._database.finish(job.id, self.name, outcome.state, outcome.reason, outcome.revision)
+        self._database.finish(
+            job.id, self.name, outcome.state, outcome.reason, outcome.revision, verdict=outcome.verdict
+        )
         told(job, outcome)
         if outcome.state is JobState.QUEUED:
             time.sleep(_OUTAGE_S)
@@ -106,11 +115,13 @@ class Worker:
                     with self._sites.store(job.site, create=True) as store:
                         head = store.head()
                         entered = enter_session(store, recording, self._config)
+                        verdict = entered.session.slam.verdict
+                        kind = "" if verdict is None else verdict.kind.value
                         if refusal := entered.refusal(self._config):
-                            return JobOutcome(JobState.ASIDE, refusal, entered.parent)
+                            return JobOutcome(JobState.ASIDE, _without(kind, refusal), entered.parent, kind)
                         took_s = time.perf_counter() - start
                         number = entered.commit(store, self._config, command="evermap work", wall_s=took_s)
-                        return JobOutcome(JobState.ENTERED, _remark(entered.session.slam), number)
+                        return JobOutcome(JobState.ENTERED, _remark(entered.session.slam), number, kind)
                 except StaleRevisionError:  # another process committed meanwhile: again, from the newest
                     continue
         except TwiceError as error:  # a worker died between the commit and saying so, or it came another way
@@ -147,10 +158,15 @@ class Worker:
 
 
 def _remark(entered: SlamResult) -> str:
-    """Return what to say of a session that entered: its verdict, in words where it is not sound, and warnings."""
+    """Return what to say of a session that entered: why its verdict is not sound, and warnings."""
     verdict = entered.verdict
-    said = [] if verdict is None else [verdict.kind.value if verdict.kind is VerdictKind.SOUND else verdict.text]
+    said = [] if verdict is None or verdict.kind is VerdictKind.SOUND else [verdict.message]
     return ", ".join([*said, *entered.warnings[:3]])
+
+
+def _without(kind: str, refusal: str) -> str:
+    """Return a reason without the verdict that it begins with, which has a column of its own."""
+    return refusal.removeprefix(f"{kind}: ") if kind else refusal
 
 
 class Crew:
