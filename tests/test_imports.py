@@ -28,7 +28,7 @@ RULES = {
     "valid": "errors types",
     "estimate": "errors compiled types geometry",
     "align": "types config geometry",
-    "io": "errors compiled interrupts types geometry valid estimate",
+    "io": "errors compiled interrupts plugins types geometry valid estimate",
     "metrics": "errors show types geometry estimate",
     "sensing": "errors compiled types config geometry",
     "existence": "errors compiled show types survival io sensing",

@@ -1,4 +1,4 @@
-"""Parts that other packages bring: studies and methods, found by their entry points."""
+"""Parts that other packages bring: studies, methods and readers, found by their entry points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def found(group: str) -> dict[str, EntryPoint]:
     """Return the entry points of a group by their names, sorted; nothing is imported.
 
     Args:
-        group: 'evermap.verbs', 'evermap.studies' or 'evermap.methods'.
+        group: 'evermap.verbs', 'evermap.studies', 'evermap.methods' or 'evermap.readers'.
     """
     return {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
 

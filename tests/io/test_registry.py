@@ -5,12 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from evermap.errors import InputError
-from evermap.io import READERS, Reader, list_robots, read_recording, reader_for
+from evermap.io import READERS, Reader, add_reader, find_readers, list_robots, read_recording, reader_for
 from evermap.types import Recording
 
 
@@ -85,3 +86,26 @@ def test_importing_loads_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
                           env={"PYTHONPATH": str(Path(__file__).parents[2] / "src")})  # fmt: skip
     assert done.stdout.strip() == "[]"
+
+
+def test_a_reader_of_ones_own_is_tried_first(
+    tmp_path: Path, mrclam: dict[str, str], lay_out: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Added in a process, or brought by a package; one with a known name takes its place."""
+    monkeypatch.setattr("evermap.io._ADDED", [])
+    path = lay_out(mrclam)
+    known = reader_for(path)
+    mine = replace(known, looks_for="mine")
+    add_reader(mine)
+    add_reader(mine)
+    assert reader_for(path) is mine
+    assert [reader.name for reader in find_readers()].count(known.name) == 1
+    (tmp_path / "day.xyz").touch()
+    brought = Reader("xyz", "day.xyz", lambda _: False, lambda *_: read_recording(path), endings=(".xyz",))
+    monkeypatch.setattr("evermap.io.found", lambda _: {"xyz": None})
+    monkeypatch.setattr("evermap.io.load", lambda group, name: {("evermap.readers", "xyz"): brought}[group, name])
+    assert reader_for(tmp_path / "day.xyz") is brought
+    assert read_recording(tmp_path / "day.xyz").name == read_recording(path).name
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"looked for .*mine; .*xyz: day\.xyz"):
+        read_recording(tmp_path / "empty")

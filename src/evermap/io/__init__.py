@@ -22,12 +22,15 @@ from evermap.io.tagslam import TAGSLAM
 from evermap.io.template import write_template
 from evermap.io.tum import read_tum, write_tum
 from evermap.io.ycbv import YCBV
+from evermap.plugins import found, load
 from evermap.types import Recording, SpatialRecording, is_in_space
 
 __all__ = [
     "READERS",
     "Reader",
     "Shift",
+    "add_reader",
+    "find_readers",
     "list_robots",
     "parse_shift",
     "read_landmarks",
@@ -48,7 +51,24 @@ __all__ = [
 ]
 
 READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, BAG, NATIVE, POSE_GRAPH)
-"""All readers, in the order in which they are tried. Add a new reader here and nowhere else."""
+"""The readers of evermap, in the order in which they are tried. Add a new reader here and nowhere else."""
+PLUGINS = "evermap.readers"
+"""Entry points of readers in other packages."""
+_ADDED: list[Reader] = []
+
+
+def add_reader(reader: Reader) -> None:
+    """Read recordings of another format from now on, in this process; packages name theirs as entry points.
+
+    It is tried before all others, and takes the place of one with its name.
+    """
+    _ADDED[:] = [reader, *(other for other in _ADDED if other.name != reader.name)]
+
+
+def find_readers() -> tuple[Reader, ...]:
+    """Return all readers in the order in which they are tried: added ones, those of evermap, those of packages."""
+    added = [*_ADDED, *(reader for reader in READERS if reader.name not in {one.name for one in _ADDED})]
+    return (*added, *(load(PLUGINS, name) for name in found(PLUGINS)))
 
 
 def reader_for(path: str | Path) -> Reader:
@@ -58,24 +78,25 @@ def reader_for(path: str | Path) -> Reader:
         InputError: nothing is there, a zip is damaged, or no reader recognises it; the message says what is looked for.
     """
     path = Path(path)
-    found = file_sets(path)
+    sets = file_sets(path)
     if path.is_file():
         refuse_pointer(head_of(path), path)
-    for reader in READERS:
+    readers = find_readers()
+    for reader in readers:
         if reader.matches(path):
             return reader
-    if path.is_file() and not found:
+    if path.is_file() and not sets:
         kind, hint = kind_of_file(path), f"its folder {path.parent}, or a zip of it"
         if kind is not None:
             is_table = kind.hint == "its folder"
             raise InputError(f"is {kind.what}, not a recording", path=path, hint=hint if is_table else kind.hint)
         raise InputError("a single file is not a recording", path=path, hint=hint)
-    kind = kind_of_folder(found, path)
+    kind = kind_of_folder(sets, path)
     if kind is not None:
         raise InputError(f"is not a recording: it holds {kind.what}", path=path, hint=kind.hint)
-    names = sorted(name for files in found for name in files.members)
+    names = sorted(name for files in sets for name in files.members)
     holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
-    wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS)
+    wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in readers)
     raise InputError(f"no recording found, it contains {holds}; looked for {wanted}", path=path)
 
 

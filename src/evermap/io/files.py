@@ -53,6 +53,8 @@ class FileSet:
         """Name of the innermost folder, or of the zip without its ending."""
         if self.folder:
             return PurePosixPath(self.folder).name
+        if self.contents is not None:
+            return self.root.stem
         return self.root.stem if self.zipped else self.root.resolve().name
 
     def path_of(self, name: str) -> Path:

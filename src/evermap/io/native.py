@@ -67,17 +67,20 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
     return _recording_of(files, str(path))
 
 
-def read_tables(tables: Mapping[str, DataFrame | Mapping[str, Any]]) -> Recording | SpatialRecording:
+def read_tables(
+    tables: Mapping[str, DataFrame | Mapping[str, Any]], *, source: str | Path = ""
+) -> Recording | SpatialRecording:
     """Return a recording from data frames: what `read_native` reads from a folder, by the names of its files.
 
     Args:
         tables: `odometry`, `detections`, and optionally the other tables, each a data frame with the columns of the
             file; `sensor` and `camera` are the sections of `sensor.toml` and `camera.toml`, as dictionaries.
+        source: file that they were made of, for messages; '' for none.
 
     Raises:
         InputError, DataError: as of `read_native`; a name that no file has, or something else than a data frame.
     """
-    memory, contents = Path("tables"), dict[str, bytes]()
+    memory, contents = Path(source or "tables"), dict[str, bytes]()
     settings = {Path(file).stem: file for file in (SENSOR_FILE, CAMERA_FILE)}
     known = (*TABLES, *measurement_names(), *settings)
     for name, table in tables.items():
@@ -93,7 +96,9 @@ def read_tables(tables: Mapping[str, DataFrame | Mapping[str, Any]]) -> Recordin
             contents[f"{name}.parquet"] = parquet_of(arrow_table(table))
         else:
             raise InputError("is no data frame", path=memory, field=name, hint="a table of pandas, polars or pyarrow")
-    return _recording_of(FileSet(memory, "", {name: name for name in contents}, zipped=False, contents=contents), "")
+    return _recording_of(
+        FileSet(memory, "", {name: name for name in contents}, zipped=False, contents=contents), str(source)
+    )
 
 
 def _recording_of(files: FileSet, source: str) -> Recording | SpatialRecording:
