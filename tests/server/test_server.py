@@ -351,7 +351,7 @@ def test_tables_of_another_version_are_one_line(tmp_path: Path) -> None:
     Database(tmp_path).close()
     with sqlite3.connect(tmp_path / "server.db") as connection:
         connection.execute("UPDATE server SET version = 9")
-    with pytest.raises(InputError, match="of version 9, this evermap has 1"):
+    with pytest.raises(InputError, match="of version 9, this evermap has 2"):
         Database(tmp_path)
 
 
