@@ -72,7 +72,7 @@ LAZY_EVERYWHERE = ("numba", "gtsam", "matplotlib", "pyarrow", "pandas", "evo", "
 
 
 def part_of(path: Path) -> str:
-    """'slam' for src/evermap/slam/graph.py, 'types' for src/evermap/types.py."""
+    """'slam' for src/evermap/slam/graph.py, 'types' for src/evermap/types/sensor.py."""
     return path.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
