@@ -91,3 +91,19 @@ def test_nothing_is_left_out_of_what_stands_is_not_stated_or_cannot_be_told() ->
     assert without_motion(few, CONFIG)[0] is few
     nameless = CONFIG.model_copy(update={"slam": CONFIG.slam.model_copy(update={"unknown_ids": True})})
     assert without_motion(recording, nameless)[0] is recording
+
+
+def test_a_noisy_sensor_does_not_make_bodies_move() -> None:
+    """Nothing is stated of its noise, which is learned from what is on no body."""
+    recording = flat(yard(1, standing=True))
+    seen, rng = recording.detections, np.random.default_rng(0)
+    unsaid, some = np.full(len(seen), np.nan), np.flatnonzero(np.isfinite(seen.range_m))
+    assert recording.sensor.sigma_range_m is None
+    range_m, bearing_rad = seen.range_m.copy(), seen.bearing_rad.copy()
+    range_m[some] = np.maximum(range_m[some] + rng.normal(0.0, 0.5, len(some)), 0.2)
+    bearing_rad[some] += rng.normal(0.0, 0.1, len(some))
+    noisy = replace(
+        seen, range_m=range_m, bearing_rad=bearing_rad, sigma_range_m=unsaid.copy(), sigma_bearing_rad=unsaid.copy()
+    )
+    kept, _ = without_motion(replace(recording, detections=noisy), CONFIG)
+    assert len(noisy) - len(kept.detections) < 0.02 * len(noisy)
