@@ -12,19 +12,16 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.pipeline import run_session, run_slam
 from evermap.slam.moving_bodies import without_motion
-from evermap.slam.plane import in_its_space
-from evermap.types import BoolArray, Recording, SlamResult, is_in_space, rows_of
-from evermap_studies.worlds.yard import STEP_S, YardConfig, YardDrive, simulate_yard
+from evermap.types import BoolArray, Recording, SlamResult, rows_of
+from evermap_studies.worlds.yard import STEP_S, YardConfig, YardDrive, flatten, simulate_yard
 
 CONFIG = Config()
 
 
 def flat(drive: YardDrive, *, stated: bool = True) -> Recording:
-    """Return a drive in the plane, ranges and bearings, with what is stated of forklifts."""
-    given = drive.recording
-    found = in_its_space(replace(given, objects=given.objects[:0]), CONFIG.slam)
-    assert not is_in_space(found)
-    return replace(found, objects=given.objects if stated else given.objects[:0])
+    """Return a drive in the plane, with what is stated of forklifts."""
+    found = flatten(drive.recording)
+    return found if stated else replace(found, objects=found.objects[:0])
 
 
 def yard(seed: int, *, standing: bool = False) -> YardDrive:
