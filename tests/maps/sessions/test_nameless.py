@@ -16,6 +16,9 @@ from evermap.geometry import se2
 from evermap.geometry.group import PLANE, SPACE, Group
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, MemberTraits
+from evermap.maps.sessions.believe import Witnessed
+from evermap.maps.sessions.decide import doubt_moves
+from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.nameless import held_at, without_ids
 from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
@@ -23,7 +26,7 @@ from evermap.pipeline import run_localization
 from evermap.runs.sessions import enter_session, rename_landmark
 from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
-from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, Recording, rows_of
+from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, rows_of
 from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
 
 from .buildings import FIXED, building, lived_through
@@ -241,6 +244,31 @@ def test_what_stands_beside_a_place_is_the_same_or_another(lived: tuple[Building
     other = (1.0 - settings.overlay.share_nudged) * (settings.boxes.p_taken * beside + by_chance)
     assert told.probability == pytest.approx(same / (same + other), rel=0.03)
     assert 0.6 < told.probability < 0.85
+
+
+def test_what_tells_that_it_is_the_same_leaves_its_move_certain(
+    lived: tuple[BuildingSimulation, list[Session]],
+) -> None:
+    """Bodies of several, landmarks with an identity, boxes, described ones, and what was seen to leave."""
+    living, config = lived[1][0].living, NAMELESS.living
+    first, second = living.members.landmark_id[:2].tolist()
+    place = np.arange(len(living.places))
+    entry = Extended(living, living, living.places.landmark_id, place, np.zeros(0), np.zeros(0, dtype=np.bool_))
+    move = MapChange((first,), ChangeKind.MOVED, 0.0, 1.0, (0.4, 0.3), 0.0, 0.99)
+
+    def doubt(change: MapChange, entry: Extended = entry, seen: Witnessed | None = None) -> float:
+        return doubt_moves((change,), seen or Witnessed.nothing(), entry, config)[0].probability
+
+    assert doubt(move) < 0.9
+    assert doubt(replace(move, landmark_ids=(first, second))) == 0.99
+    assert doubt(replace(move, kind=ChangeKind.ROTATED)) == 0.99
+    assert doubt(replace(move, landmark_ids=(12_345,))) == 0.99
+    seen = Witnessed(np.array([first]), np.zeros(1), np.zeros(1), np.ones(1))
+    assert doubt(move, seen=seen) == 0.99
+    described = living.traits.met(np.array([first]), ("shine",), np.ones((1, 1)))
+    box = replace(living.boxes, landmark_id=np.array([first]), size_m=np.ones((1, 3)))
+    for known in (replace(living, traits=described), replace(living, boxes=box)):
+        assert doubt(move, replace(entry, living=known)) == 0.99
 
 
 def test_localising_frame_by_frame_needs_identities(lived: tuple[BuildingSimulation, list[Session]]) -> None:
