@@ -1,9 +1,14 @@
 """Is the car where one stood that one, or another? Days on a street on which cars and vans come and go, beside truth.
 
 For each box that stands where one stood a drive before: what is said of it, in classes of the stated probability that
-it is another one, the truth beside it. A box that is told as the same has the complement of its match.
+it is another one, the truth beside it. One that is told as the same counts as 0.
 
-    python -m benchmarks.same_or_other --seeds 10
+    python -m benchmarks.same_or_other --seeds 10           # as many wrong sizes as the settings say
+    python -m benchmarks.same_or_other --seeds 10 --odd 0   # a detector that always sees the right size
+
+How many boxes are seen with a wrong size, a drive long, is a setting (`living.boxes.odd_share`, in either of two
+drives): in one session that looks like others that took their places. Where a detector sees fewer, the probability of
+another one is too low.
 """
 
 from __future__ import annotations
@@ -16,8 +21,9 @@ from collections.abc import Sequence
 import numpy as np
 
 import evermap as em
+from evermap.config import BoxesConfig
 from evermap.types import ChangeKind
-from evermap_studies.worlds.parking import StreetConfig, simulate_street
+from evermap_studies.worlds.parking import USUAL, StreetConfig, simulate_street
 
 EDGES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 WITHIN_S = 20.0
@@ -71,10 +77,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--days", type=int, default=5)
+    parser.add_argument("--odd", type=float, default=0.5 * BoxesConfig().odd_share, help="share of wrong sizes")
     chosen = parser.parse_args(arguments)
     rows, counts = list[Row](), Counter[str]()
+    config = StreetConfig(days=chosen.days, faults=USUAL._replace(odd=chosen.odd))
     for seed in range(chosen.first, chosen.first + chosen.seeds):
-        more, others = score_street(StreetConfig(days=chosen.days), seed)
+        more, others = score_street(config, seed)
         rows += more
         counts.update(others)
     table = np.array(rows, dtype=np.float64).reshape(-1, 2)

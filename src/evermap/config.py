@@ -881,7 +881,7 @@ class BoxesConfig(Section):
     size_nats: Positive = key(8.0, "evidence of size or heading against a match, at most [nats]")
     heading_rad: Positive = key(0.15, "standard deviation of headings [rad]")
     round: Positive = key(1.3, "boxes less long than this times their width have no heading")
-    odd_share: Share = key(0.05, "share of boxes that are seen with any size of their class")
+    odd_share: Share = key(0.05, "share of boxes that one of two sessions sees with any size of their class")
     other_class_nats: float = key(-3.0, "log odds of being detected as of another class", le=0.0)
     density: Positive = key(0.02, "least density of static boxes [1/m^2]")
     p_taken: Share = key(0.2, "usual probability that another box takes the place of one that left")

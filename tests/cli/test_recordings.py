@@ -15,6 +15,7 @@ from evermap.cli.main import app
 from evermap.geometry import se3
 from evermap.io import read_recording
 from evermap.maps.store.measured import pack_recording, unpack_recording
+from evermap.types import Recording
 from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, looked_at, simulate_building
 
 SIMULATION = ["--days", "2", "--sessions-per-day", "2", "--patrol-s", "20", "--seed", "3"]
@@ -115,6 +116,19 @@ def test_a_yard_is_written_with_its_bodies(tmp_path: Path) -> None:
     with (standing / "bodies_truth.csv").open(encoding="utf-8", newline="") as file:
         places = {(row["object_id"], row["x_m"], row["y_m"]) for row in csv.DictReader(file)}
     assert len(places) == 6
+    flat = tmp_path / "plane"
+    assert run("simulate", "yard", flat, "--days", "1", "--moving", "3", "--seed", "2", "--plane").exit_code == 0
+    seen = read_recording(flat / "day00_session00")
+    assert isinstance(seen, Recording)
+    assert (flat / "bodies_truth.csv").read_text("utf-8") == (out / "bodies_truth.csv").read_text("utf-8")
+    np.testing.assert_array_equal(seen.objects, recording.objects)
+    pose = seen.truth.pose_world_robot[seen.detections.frame]
+    angle = pose[:, 2] + seen.detections.bearing_rad
+    at = pose[:, :2] + seen.detections.range_m[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    on_walls = ~np.isin(seen.detections.landmark_id, seen.objects[:, 0])
+    for name in np.unique(seen.detections.landmark_id[on_walls]):
+        assert np.ptp(at[seen.detections.landmark_id == name], axis=0).max() < 2.0
+    assert run("simulate", "street", tmp_path / "no", "--plane").exit_code == 2
     assert run("simulate", "street", tmp_path / "no", "--standing").exit_code == 2
     assert run("simulate", "yard", tmp_path / "no", "--doors").exit_code == 2
 

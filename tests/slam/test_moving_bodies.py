@@ -12,19 +12,16 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.pipeline import run_session, run_slam
 from evermap.slam.moving_bodies import without_motion
-from evermap.slam.plane import in_its_space
-from evermap.types import BoolArray, Recording, SlamResult, is_in_space, rows_of
-from evermap_studies.worlds.yard import STEP_S, YardConfig, YardDrive, simulate_yard
+from evermap.types import BoolArray, Recording, SlamResult, rows_of
+from evermap_studies.worlds.yard import STEP_S, YardConfig, YardDrive, flatten, simulate_yard
 
 CONFIG = Config()
 
 
 def flat(drive: YardDrive, *, stated: bool = True) -> Recording:
-    """Return a drive in the plane, ranges and bearings, with what is stated of forklifts."""
-    given = drive.recording
-    found = in_its_space(replace(given, objects=given.objects[:0]), CONFIG.slam)
-    assert not is_in_space(found)
-    return replace(found, objects=given.objects if stated else given.objects[:0])
+    """Return a drive in the plane, with what is stated of forklifts."""
+    found = flatten(drive.recording)
+    return found if stated else replace(found, objects=found.objects[:0])
 
 
 def yard(seed: int, *, standing: bool = False) -> YardDrive:
@@ -91,3 +88,19 @@ def test_nothing_is_left_out_of_what_stands_is_not_stated_or_cannot_be_told() ->
     assert without_motion(few, CONFIG)[0] is few
     nameless = CONFIG.model_copy(update={"slam": CONFIG.slam.model_copy(update={"unknown_ids": True})})
     assert without_motion(recording, nameless)[0] is recording
+
+
+def test_a_noisy_sensor_does_not_make_bodies_move() -> None:
+    """Nothing is stated of its noise, which is learned from what is on no body."""
+    recording = flat(yard(1, standing=True))
+    seen, rng = recording.detections, np.random.default_rng(0)
+    unsaid, some = np.full(len(seen), np.nan), np.flatnonzero(np.isfinite(seen.range_m))
+    assert recording.sensor.sigma_range_m is None
+    range_m, bearing_rad = seen.range_m.copy(), seen.bearing_rad.copy()
+    range_m[some] = np.maximum(range_m[some] + rng.normal(0.0, 0.5, len(some)), 0.2)
+    bearing_rad[some] += rng.normal(0.0, 0.1, len(some))
+    noisy = replace(
+        seen, range_m=range_m, bearing_rad=bearing_rad, sigma_range_m=unsaid.copy(), sigma_bearing_rad=unsaid.copy()
+    )
+    kept, _ = without_motion(replace(recording, detections=noisy), CONFIG)
+    assert len(noisy) - len(kept.detections) < 0.02 * len(noisy)

@@ -20,9 +20,6 @@ from evermap.slam.result import poses_at
 from evermap.slam.space.bodies import FEWEST, NEAR_S, STILL_M, find_moving
 from evermap.types import UNKNOWN, Recording, rows_of
 
-SIGMA_SHARE, SIGMA_RAD = 0.02, 0.02
-"""Noise of ranges, as a share, and of bearings of a sensor of which nothing is stated."""
-
 
 def without_motion(recording: Recording, config: Config) -> tuple[Recording, tuple[str, ...]]:
     """Return a recording without what was seen of stated bodies while they moved, and a remark on it.
@@ -55,9 +52,8 @@ def without_motion(recording: Recording, config: Config) -> tuple[Recording, tup
     pose = se2.compose(poses_at(solved, stamps)[0], np.array(recording.sensor.mount_robot_sensor))[of]
     angle, range_m = pose[:, 2] + seen.bearing_rad[rows], seen.range_m[rows]
     at_m = pose[:, :2] + range_m[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    sensor, along_m, across_rad = recording.sensor, seen.sigma_range_m[rows], seen.sigma_bearing_rad[rows]
-    along_m = np.where(np.isnan(along_m), sensor.sigma_range_m or SIGMA_SHARE * range_m, along_m)
-    across_rad = np.where(np.isnan(across_rad), sensor.sigma_bearing_rad or SIGMA_RAD, across_rad)
+    stated = np.column_stack([seen.sigma_range_m, seen.sigma_bearing_rad])[rows]
+    along_m, across_rad = solved.outcome.smoother.noise.of_detections(stated).T
     sigma_m = np.sqrt(0.5 * (along_m**2 + (across_rad * range_m) ** 2) + STILL_M**2)
     moves = np.zeros(len(seen), dtype=np.bool_)
     for one in np.unique(body[rows]):

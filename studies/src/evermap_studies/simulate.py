@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BUILDING, STREET, YARD = WORLDS = ("building", "street", "yard")
 OF_BUILDINGS = ("patrol_s", "change_rate", "doors", "wing_opens_day", "clutter")
 """Options of buildings alone."""
-OF_YARDS = ("standing", "moving")
+OF_YARDS = ("standing", "moving", "plane")
 """And of yards."""
 STAYS_FILE = "stays_truth.csv"
 BODIES_FILE = "bodies_truth.csv"
@@ -62,6 +62,7 @@ def simulate(
         int, typer.Option(min=0, max=6, help="Forklifts of a yard, of six, that drive while the robot is there.")
     ] = 4,
     standing: Annotated[bool, typer.Option("--standing", help="The same yard with nothing that moves.")] = False,
+    plane: Annotated[bool, typer.Option("--plane", help="The yard seen as ranges and bearings on the floor.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
     force: Annotated[
         bool,
@@ -78,7 +79,8 @@ def simulate(
     without identity in space; stays_truth.csv has who stood where, from when until when.
 
     A yard has forklifts that carry tags, seen in space: some drive and stop while the robot is there, the others are
-    parked, elsewhere in each session; bodies_truth.csv has where each forklift was in each frame.
+    parked, elsewhere in each session; bodies_truth.csv has where each forklift was in each frame. With --plane the
+    same drives are recordings in the plane.
 
     \b
     Example:
@@ -104,9 +106,10 @@ def simulate(
             from evermap_studies.worlds.yard import YardConfig
 
             config = YardConfig(
-                days=days, drives_per_day=sessions_per_day, moving=moving, parked=6 - moving, standing=standing
-            )
-            names = _write_yard(where, config, seed, force=force)
+                days=days, drives_per_day=sessions_per_day, moving=moving, parked=6 - moving, standing=standing,
+                oriented=not plane,
+            )  # fmt: skip
+            names = _write_yard(where, config, seed, plane=plane, force=force)
         if as_json:
             print_json({"out": str(where), "sessions": names, "seed": seed})
         else:
@@ -166,12 +169,12 @@ def _write_street(out: Path, days: int, drives_per_day: int, seed: int, *, force
     return names
 
 
-def _write_yard(out: Path, config: YardConfig, seed: int, *, force: bool) -> list[str]:
+def _write_yard(out: Path, config: YardConfig, seed: int, *, plane: bool, force: bool) -> list[str]:
     """Write the drives through a yard and where its forklifts were; return their names."""
     from evermap.io import write_native
     from evermap.io.files import write_atomic
     from evermap.runs.folder import RunFolder
-    from evermap_studies.worlds.yard import simulate_yard
+    from evermap_studies.worlds.yard import flatten, simulate_yard
 
     folder = RunFolder(out, force=force, renew=False)
     drives, count = simulate_yard(config, seed), config.drives_per_day
@@ -184,7 +187,7 @@ def _write_yard(out: Path, config: YardConfig, seed: int, *, force: bool) -> lis
             lines += [f"{name},{one},{at!r},{x!r},{y!r},{yaw!r},{int(on)}\n" for at, (x, y, yaw), on in rows]
     with folder:
         for name, drive in zip(names, drives, strict=True):
-            write_native(drive.recording, folder.path(name))
+            write_native(flatten(drive.recording) if plane else drive.recording, folder.path(name))
         write_atomic(folder.path(BODIES_FILE), "".join(lines))
     return names
 

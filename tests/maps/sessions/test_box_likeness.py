@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from evermap.config import BoxesConfig
+from evermap.config import BoxesConfig, SlamConfig
 from evermap.maps.sessions import box_likeness
 from evermap.maps.sessions.box_likeness import BoxLikeness, BoxPairs
+from evermap.maps.sessions.box_search import MapBoxes
+from evermap.maps.sessions.box_visit import SeenBoxes
 from evermap.types import FloatArray
 
 SETTINGS = BoxesConfig()
 USUAL = BoxLikeness.usual(SETTINGS)
+NOTHING = np.zeros(0)
 SAME_M, OTHER_M = np.array(SETTINGS.sigma_size_m), np.array(SETTINGS.sigma_class_m)
 
 
@@ -89,14 +92,84 @@ def test_nothing_seen_leaves_the_usual_spread() -> None:
 def test_how_often_places_are_taken_again_is_learned() -> None:
     """Of 60 boxes the half are others: hazards were faster, or places are taken more often, than was believed."""
     p = np.full(60, 0.9)
-    fast = box_likeness._turnover(p, np.repeat([1.0, 0.0], 30), SETTINGS)
-    slow = box_likeness._turnover(p, np.ones(60), SETTINGS)
+    fast = box_likeness._turnover(p, np.repeat([1.0, 0.0], 30), NOTHING, SETTINGS)
+    slow = box_likeness._turnover(p, np.ones(60), NOTHING, SETTINGS)
     assert fast[0] > 3.0 > 1.5 > slow[0]
     assert fast[1] > slow[1]
 
 
+def test_places_that_stay_empty_are_seldom_taken_again() -> None:
+    """Of 60 places 30 have another box: beside none that are empty all are taken, beside 90 one in four."""
+    p, p_same = np.full(60, 0.5), np.repeat([1.0, 0.0], 30)
+    full = box_likeness._turnover(p, p_same, NOTHING, SETTINGS)
+    empty = box_likeness._turnover(p, p_same, np.full(90, 0.5), SETTINGS)
+    assert full[1] > 0.7
+    assert empty[1] < 0.35
+    assert empty[0] > full[0] * 1.5  # three in four are not there: faster than was believed
+    gone = box_likeness._turnover(p, p_same, np.full(90, 1e-6), SETTINGS)
+    assert gone[0] == pytest.approx(full[0], rel=0.4)  # what was known to have left says nothing of hazards
+
+
+def test_a_box_that_is_missed_has_not_left() -> None:
+    """One in ten is not detected at its place (`p_stands`)."""
+    usual = box_likeness._turnover(np.full(90, 0.99), np.ones(90), np.full(10, 0.99), SETTINGS)
+    surely = box_likeness._turnover(
+        np.full(90, 0.99), np.ones(90), np.full(10, 0.99), SETTINGS.model_copy(update={"p_stands": 0.999})
+    )
+    assert usual[0] < 2.0 < surely[0]
+
+
+def lay_boxes(at_m: list[float], p: list[float]) -> MapBoxes:
+    """A map's boxes along x, 1.7 m wide."""
+    n = len(at_m)
+    position_m = np.column_stack([at_m, np.zeros((n, 2))])
+    return MapBoxes(
+        np.arange(n), np.arange(n), np.zeros(n, dtype=np.int64), position_m, np.zeros((n, 3, 3)), np.zeros(n),
+        np.tile([4.2, 1.7, 1.5], (n, 1)), np.array(p), SETTINGS, SlamConfig(),
+    )  # fmt: skip
+
+
+def test_a_place_counts_once_as_empty_and_only_beside_what_was_seen() -> None:
+    """One box is seen; of two that stood at 10 m the one that more probably does counts; 40 m are too far."""
+    known = lay_boxes([0.0, 10.2, 10.0, 40.0], [0.9, 0.1, 0.6, 0.9])
+    away_m = np.abs(known.position_m[None, :, 0])
+    pairs = BoxPairs(away_m, *(np.zeros((1, 4)),) * 4, away_m < 1.0, away_m < 1.0, known.p[None])
+    assert box_likeness._find_empty(pairs, known).tolist() == [2]
+
+
+def see_boxes(known: MapBoxes, rows: list[int], longer_m: float) -> SeenBoxes:
+    """Boxes where some of the map's stand, that much longer."""
+    n = len(rows)
+    place, zeros = np.arange(n), np.zeros(n)
+    return SeenBoxes(
+        place, zeros.astype(np.int64), place, known.position_m[rows], np.zeros((n, 3, 3)), zeros,
+        known.size_m[rows] + [longer_m, 0.2, 0.2], zeros, zeros, zeros + np.nan, zeros + np.nan, zeros + 1.0,
+    )  # fmt: skip
+
+
+def test_empty_places_beside_others_are_learned_from() -> None:
+    """On every third place stands another box: where the others are empty, places are seldom taken again."""
+    known = lay_boxes((8.0 * np.arange(30)).tolist(), [0.5] * 30)
+    seen = see_boxes(known, list(range(0, 30, 3)), 2.0)
+    beside = box_likeness.learn_likeness(seen, known, np.zeros(10))
+    alone = lay_boxes((24.0 * np.arange(10)).tolist(), [0.5] * 10)
+    full = box_likeness.learn_likeness(see_boxes(alone, list(range(10)), 2.0), alone, np.zeros(10))
+    assert beside.p_taken < 0.4 < 0.5 < full.p_taken
+
+
+def test_of_two_explanations_the_one_with_the_empty_places_is_more_probable() -> None:
+    p_empty = np.array([0.5, 0.2])
+    often, seldom = (replace(USUAL, p_taken=one) for one in (0.9, 0.1))
+    for one in (often, seldom):
+        more = box_likeness._log_posterior(one, ONE, USUAL, p_empty) - box_likeness._log_posterior(
+            one, ONE, USUAL, NOTHING
+        )
+        expected = np.log(p_empty * (1.0 - SETTINGS.p_stands) + (1.0 - p_empty) * (1.0 - one.p_taken)).sum()
+        assert more == pytest.approx(expected)
+
+
 def test_no_boxes_leave_hazards_and_places_as_usual() -> None:
-    haste, p_taken = box_likeness._turnover(np.zeros(0), np.zeros(0), SETTINGS)
+    haste, p_taken = box_likeness._turnover(NOTHING, NOTHING, NOTHING, SETTINGS)
     assert haste == pytest.approx(1.0)
     assert p_taken == pytest.approx(SETTINGS.p_taken, abs=0.02)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from evermap.config import Config, OverlayConfig
 from evermap.errors import ConfigError
@@ -15,13 +16,17 @@ from evermap.geometry import se2
 from evermap.geometry.group import PLANE, SPACE, Group
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, MemberTraits
+from evermap.maps.sessions.believe import Witnessed
+from evermap.maps.sessions.decide import doubt_moves
+from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.nameless import held_at, without_ids
 from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
 from evermap.runs.sessions import enter_session, rename_landmark
+from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
-from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, Recording, rows_of
+from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, rows_of
 from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
 
 from .buildings import FIXED, building, lived_through
@@ -206,6 +211,64 @@ def test_another_class_where_one_stood_is_one_change(lived: tuple[BuildingSimula
     assert not any(new in change.landmark_ids for change in session.changes if change is not told[0])
     row = after.landmark_id.tolist().index(new)
     assert after.class_names[int(after.class_id[row])] == "chair"
+
+
+def test_what_stands_beside_a_place_is_the_same_or_another(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    """Of landmarks without identity nothing tells a nudge from a replacement: the odds are those of the settings."""
+    one, sessions = lived
+    before, now, called = names(one, sessions, 0), names(one, sessions, 1), sessions[0].living.landmark_names
+    true, given = one.truths[1].detection_landmark_id, one.sessions[1].detections
+    seen = np.bincount(true[true >= 0])
+    alone = [name for name in before if now.get(name) == before[name] and called[name].startswith("marker")]
+    name = max(alone, key=lambda name: int(seen[before[name]]))
+    mine = np.flatnonzero(true == before[name])
+    pose = one.truths[1].pose_world_sensor[given.frame[mine]]
+    angle = pose[:, 2] + given.bearing_rad[mine]
+    off_m = given.range_m[mine, None] * np.column_stack([np.cos(angle), np.sin(angle)]) + [0.4, 0.3]
+    range_m, bearing_rad = given.range_m.copy(), given.bearing_rad.copy()
+    range_m[mine] = np.hypot(*off_m.T)
+    bearing_rad[mine] = se2.wrap(np.arctan2(off_m[:, 1], off_m[:, 0]) - pose[:, 2])
+    shifted = replace(given, range_m=range_m, bearing_rad=bearing_rad)
+    moved = replace(one.sessions[1], detections=shifted)
+    session = lived_through([moved], NAMELESS, sessions[0].living)[0]
+    (told,) = (change for change in session.changes if change.landmark_ids == (name,))
+    assert told.kind is ChangeKind.MOVED
+    assert np.hypot(*told.displacement_m) == pytest.approx(0.5, abs=0.15)
+    settings, spread_m2 = NAMELESS.living, np.array(told.displacement_covariance_m2)
+    nudged, beside = (
+        stats.multivariate_normal.pdf(np.array(told.displacement_m), np.zeros(2), spread_m2 + sigma_m**2 * np.eye(2))
+        for sigma_m in (settings.overlay.nudge_m, settings.boxes.beside_m)
+    )
+    same = settings.overlay.share_nudged * nudged
+    by_chance = density_of_unmet(session.living.landmarks().position_m)
+    other = (1.0 - settings.overlay.share_nudged) * (settings.boxes.p_taken * beside + by_chance)
+    assert told.probability == pytest.approx(same / (same + other), rel=0.03)
+    assert 0.6 < told.probability < 0.85
+
+
+def test_what_tells_that_it_is_the_same_leaves_its_move_certain(
+    lived: tuple[BuildingSimulation, list[Session]],
+) -> None:
+    """Bodies of several, landmarks with an identity, boxes, described ones, and what was seen to leave."""
+    living, config = lived[1][0].living, NAMELESS.living
+    first, second = living.members.landmark_id[:2].tolist()
+    place = np.arange(len(living.places))
+    entry = Extended(living, living, living.places.landmark_id, place, np.zeros(0), np.zeros(0, dtype=np.bool_))
+    move = MapChange((first,), ChangeKind.MOVED, 0.0, 1.0, (0.4, 0.3), 0.0, 0.99)
+
+    def doubt(change: MapChange, entry: Extended = entry, seen: Witnessed | None = None) -> float:
+        return doubt_moves((change,), seen or Witnessed.nothing(), entry, config)[0].probability
+
+    assert doubt(move) < 0.9
+    assert doubt(replace(move, landmark_ids=(first, second))) == 0.99
+    assert doubt(replace(move, kind=ChangeKind.ROTATED)) == 0.99
+    assert doubt(replace(move, landmark_ids=(12_345,))) == 0.99
+    seen = Witnessed(np.array([first]), np.zeros(1), np.zeros(1), np.ones(1))
+    assert doubt(move, seen=seen) == 0.99
+    described = living.traits.met(np.array([first]), ("shine",), np.ones((1, 1)))
+    box = replace(living.boxes, landmark_id=np.array([first]), size_m=np.ones((1, 3)))
+    for known in (replace(living, traits=described), replace(living, boxes=box)):
+        assert doubt(move, replace(entry, living=known)) == 0.99
 
 
 def test_localising_frame_by_frame_needs_identities(lived: tuple[BuildingSimulation, list[Session]]) -> None:

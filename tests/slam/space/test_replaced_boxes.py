@@ -7,10 +7,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from evermap.geometry import se3
 from evermap.pipeline import run_session
 from evermap.types import ChangeKind, MapChange
 from evermap.viz.change_words import what
-from evermap_studies.worlds.parking import StreetConfig, simulate_street
+from evermap_studies.worlds.parking import Faults, Parking, StreetConfig, simulate_street
 
 ALONE = (ChangeKind.APPEARED, ChangeKind.RETURNED, ChangeKind.VANISHED)
 
@@ -59,3 +60,23 @@ def test_what_was_replaced_is_not_told_as_two_facts(told) -> None:
     assert all(np.hypot(*one.displacement_m[:2]) < 1.5 for one in changes)
     assert max(one.probability for one in changes) < 1.0
     assert "was replaced or is the same" in what(changes[0])
+
+
+def test_a_detector_may_see_wrong_sizes_for_a_whole_drive() -> None:
+    """The share of boxes that look like any car, as `benchmarks.same_or_other` draws it; one drive sees one size."""
+    parking = Parking.of(0)
+    for slot in range(36):
+        parking.park(np.random.default_rng(slot), slot, -1.0, 1e9)
+    right, wrong = (parking.drive(1, 0.0, faults=Faults(odd=odd), moving=0) for odd in (0.0, 0.5))
+    true_m = np.array([one.size_m[0] for one in parking.spells])
+    shares = []
+    for drive in (right, wrong):
+        assert drive.truth is not None
+        at = se3.transform(drive.truth.pose_world_robot[drive.detections.frame], drive.detections.position_sensor_m)
+        away_m = np.linalg.norm(at[:, None, :2] - parking.slot[None, :, :2], axis=2)
+        near = (away_m.min(axis=1) < 1.0) & (np.linalg.norm(drive.detections.position_sensor_m, axis=1) < 20.0)
+        slot, length_m = away_m.argmin(axis=1)[near], drive.detections.size_m[near, 0]
+        seen_m = np.array([np.median(length_m[slot == one]) for one in np.unique(slot)])
+        shares.append(float((np.abs(seen_m - true_m[np.unique(slot)]) > 0.15).mean()))
+    assert shares[0] < 0.1
+    assert 0.2 < shares[1] < 0.6

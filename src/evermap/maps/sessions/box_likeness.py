@@ -2,8 +2,9 @@
 
 A box where one stood is that one, or another that came when it had left. How well a detector repeats sizes, how sizes
 differ within a class, how often a place that was left is taken again and how near to the former middle: all are learned
-by expectation and maximisation over the boxes of a session that stand where the map has one, from the settings as
-priors.
+by expectation and maximisation over the boxes of a session that stand where the map has one, and over the places beside
+them where nothing stands, from the settings as priors. How many boxes are seen with an odd size is not: in one session
+that looks like others that took their places.
 """
 
 from __future__ import annotations
@@ -155,17 +156,35 @@ def learn_likeness(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> Box
     other_size_m = np.array([_spread(*_within(seen, known, axis), usual.other_size_m[axis]) for axis in range(3)])
     away_m = np.where(pairs.over & pairs.alike, pairs.away_m, np.inf)
     mine = np.flatnonzero(np.isfinite(away_m.min(axis=1)))
-    paired = pairs.at(mine, away_m.argmin(axis=1)[mine])
+    paired, p_empty = pairs.at(mine, away_m.argmin(axis=1)[mine]), known.p[_find_empty(pairs, known)]
     starts = (
         replace(usual, other_size_m=other_size_m),
         replace(usual, other_size_m=other_size_m, p_taken=0.7, beside_m=0.3 * usual.beside_m, haste=3.0),
     )
-    found = [_maximise(start, paired, usual) for start in starts]
-    return max(found, key=lambda one: _log_posterior(one, paired, usual))
+    found = [_maximise(start, paired, usual, p_empty) for start in starts]
+    return max(found, key=lambda one: _log_posterior(one, paired, usual, p_empty))
 
 
-def _maximise(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> BoxLikeness:
-    """The most probable one near to where it begins, by pairs (K, 1) of boxes that stand over each other."""
+def _find_empty(pairs: BoxPairs, known: MapBoxes) -> IntArray:
+    """Rows of the map's boxes that a session does not see, though it sees others near; of several that stood at one
+    place the one that most probably does.
+    """
+    missed = np.flatnonzero(~pairs.over.any(axis=0) & (pairs.away_m.min(axis=0) < known.settings.among_m))
+    missed = missed[np.argsort(-known.p[missed], kind="stable")]
+    width = np.nan_to_num(known.size_m[missed, 1], nan=0.5)
+    near_m = known.settings.same_share * 0.5 * (width[:, None] + width)
+    away_m = np.linalg.norm(known.position_m[missed, None, :2] - known.position_m[missed, :2], axis=2)
+    first = ~np.tril(away_m < near_m, -1).any(axis=1)
+    return np.asarray(missed[first], dtype=np.int64)
+
+
+def _maximise(
+    found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness, p_empty: FloatArray | None = None
+) -> BoxLikeness:
+    """The most probable one near to where it begins, by pairs (K, 1) of boxes that stand over each other, and beliefs
+    (E,) in what stood where nothing is seen.
+    """
+    p_empty = np.zeros(0) if p_empty is None else p_empty
     settings, size_m, away_m = usual.settings, paired.size_m[:, 0], paired.away_m[:, 0]
     sized = np.isfinite(size_m).all(axis=1)
     for _ in range(ROUNDS):
@@ -177,24 +196,39 @@ def _maximise(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> BoxLi
             for axis in range(3)
         ])  # fmt: skip
         beside_m = _spread(2.0 * float((1.0 - p_same).sum()), float((1.0 - p_same) @ away_m**2), usual.beside_m)
-        haste, p_taken = _turnover(paired.p[:, 0], p_same, settings)
+        haste, p_taken = _turnover(paired.p[:, 0], p_same, p_empty, settings)
         found = BoxLikeness(
             np.minimum(same_size_m, found.other_size_m), found.other_size_m, p_taken, beside_m, haste, settings
         )
     return found
 
 
-def _turnover(p: FloatArray, p_same: FloatArray, settings: BoxesConfig) -> tuple[float, float]:
+def _turnover(p: FloatArray, p_same: FloatArray, p_empty: FloatArray, settings: BoxesConfig) -> tuple[float, float]:
     """The most probable factor on hazards, of which little may be known when the first boxes have left, and the
-    probability that a place is taken again. Only places with a box are counted, as the same one or another one.
+    probability that a place is taken again.
+
+    Args:
+        p: (K,) beliefs in boxes where one stands.
+        p_same: (K,) that it is the same.
+        p_empty: (E,) in boxes where nothing is seen: they left and nothing came, or they are missed.
+        settings: priors, and how often a box is missed.
     """
     haste, p_taken = np.exp(np.linspace(-3.0, 3.0, 49)), np.linspace(0.02, 0.98, 33)
-    stays = np.clip(p[:, None] ** haste, LEAST_P, 1.0 - settings.least_gone)[..., None]
-    taken = (1.0 - stays) * p_taken
-    fit = np.tensordot(p_same, np.log(stays), 1) + np.tensordot(1.0 - p_same, np.log(taken), 1)
-    fit = fit - np.log(stays + taken).sum(axis=0) + _log_prior(haste[:, None], p_taken, settings)
+    stays, gone = (_belief(one[:, None], haste, settings)[..., None] for one in (p, p_empty))
+    fit = np.tensordot(p_same, np.log(stays), 1) + np.tensordot(1.0 - p_same, np.log((1.0 - stays) * p_taken), 1)
+    fit = fit + _log_empty(gone, p_taken, settings).sum(axis=0) + _log_prior(haste[:, None], p_taken, settings)
     row, column = np.unravel_index(np.argmax(fit), fit.shape)
     return float(haste[row]), float(p_taken[column])
+
+
+def _belief(p: FloatArray, haste: FloatArray | float, settings: BoxesConfig) -> FloatArray:
+    """Probabilities that boxes stand, if hazards are `haste` times what is believed."""
+    return np.asarray(np.clip(p**haste, LEAST_P, 1.0 - settings.least_gone))
+
+
+def _log_empty(stays: FloatArray, p_taken: FloatArray | float, settings: BoxesConfig) -> FloatArray:
+    """Log probability that nothing is seen where boxes stood that stand still with probability `stays`."""
+    return np.asarray(np.log(stays * (1.0 - settings.p_stands) + (1.0 - stays) * (1.0 - p_taken)))
 
 
 def _log_prior(haste: FloatArray, p_taken: FloatArray, settings: BoxesConfig) -> FloatArray:
@@ -203,14 +237,14 @@ def _log_prior(haste: FloatArray, p_taken: FloatArray, settings: BoxesConfig) ->
     return np.asarray(TAKEN_STAYS * often - 0.5 * (np.log(haste) / settings.haste_nats) ** 2)
 
 
-def _log_posterior(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness) -> float:
-    """Log posterior density of what pairs (K, 1) have in common, but for a constant."""
+def _log_posterior(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness, p_empty: FloatArray) -> float:
+    """Log posterior density of what pairs (K, 1) and empty places (E,) have in common, but for a constant."""
     settings = found.settings
-    stays = np.clip(paired.p[:, 0] ** found.haste, LEAST_P, 1.0 - settings.least_gone)
-    fit = np.logaddexp(*found.log_likelihoods(paired))[:, 0] - np.log(stays + (1.0 - stays) * found.p_taken)
+    fit = np.logaddexp(*found.log_likelihoods(paired))[:, 0].sum()
+    fit += _log_empty(_belief(p_empty, found.haste, settings), found.p_taken, settings).sum()
     spreads = np.append(found.same_size_m, found.beside_m) / np.append(usual.same_size_m, usual.beside_m)
     prior = float(_log_prior(np.array(found.haste), np.array(found.p_taken), settings))
-    return float(fit.sum()) + prior - 0.5 * float((np.log(spreads) ** 2).sum()) / NATS**2
+    return float(fit) + prior - 0.5 * float((np.log(spreads) ** 2).sum()) / NATS**2
 
 
 def _within(seen: SeenBoxes, known: MapBoxes, axis: int) -> tuple[float, float]:

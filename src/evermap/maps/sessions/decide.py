@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap.config import DecisionConfig
+from evermap.config import DecisionConfig, LivingConfig
 from evermap.geometry.chunked import of_places, taken
+from evermap.maps.bodies import log_density
 from evermap.maps.diff import COMES, elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
@@ -15,6 +16,7 @@ from evermap.maps.names import is_anonymous
 from evermap.maps.sessions.believe import Believed, Witnessed
 from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
+from evermap.slam.association.assignment import density_of_unmet
 from evermap.types import UNKNOWN, BoolArray, ChangeKind, FloatArray, IntArray, MapChange, landmark_id_of
 
 USUAL = DecisionConfig()
@@ -153,6 +155,40 @@ def join_replaced(
             replace(went, kind=ChangeKind.REPLACED, landmark_ids=pair_ids, displacement_m=shift_m, n_hits=hits)
         )
     return (*told, *joined)
+
+
+def doubt_moves(
+    changes: tuple[MapChange, ...], what: Witnessed, entry: Extended, config: LivingConfig
+) -> tuple[MapChange, ...]:
+    """Return the changes with moves of landmarks without identity as probable as that they are the same ones.
+
+    What left a place was moved a little, or is gone and another one of its class was put next to where it stood, or
+    stands there by chance: nothing that was seen tells which. Several that moved as one body are the same, and what a
+    landmark is like, or the size of a box, tells by itself.
+
+    Args:
+        changes: of a session.
+        what: which were seen to leave or arrive.
+        entry: the map before its beliefs were updated, with the session's landmarks.
+        config: how moves and replacements are.
+    """
+    living, moves, others = entry.living, config.overlay, config.boxes
+    nameless = {landmark_id_of(one) for one in living.landmark_texts if is_anonymous(one)}
+    nameless -= {*living.boxes.landmark_id.tolist(), *living.traits.landmark_id.tolist(), *what.landmark_id.tolist()}
+    by_chance, told = density_of_unmet(living.places.position_m[entry.place]), list(changes)
+    for k, one in enumerate(changes):
+        if one.kind is not ChangeKind.MOVED or len(one.landmark_ids) > 1 or one.landmark_ids[0] not in nameless:
+            continue
+        off_m, each = np.array(one.displacement_m), np.eye(living.dim)
+        spread_m2 = np.array(one.displacement_covariance_m2) if one.displacement_covariance_m2 else 0.0 * each
+        nudged, beside = (
+            float(np.exp(log_density(off_m, spread_m2 + sigma_m**2 * each)))
+            for sigma_m in (moves.nudge_m, others.beside_m)
+        )
+        same = moves.share_nudged * nudged
+        other = (1.0 - moves.share_nudged) * (others.p_taken * beside + by_chance)
+        told[k] = replace(one, probability=one.probability * same / (same + other))
+    return tuple(told)
 
 
 class _Session:

@@ -315,6 +315,7 @@ def judged(
     )
     after, changes = decide.with_replaced(after, changes, visit.witnessed, entry)
     changes = decide.join_replaced(changes, visit.witnessed, entry, config.decisions)
+    changes = decide.doubt_moves(changes, visit.witnessed, entry, config)
     if config.cliques and config.existence and config.misses:
         after = without_missed(entry.before, after, config.grouping)
     after = decide.without_forgotten(after, config.most_sites, config.decisions)

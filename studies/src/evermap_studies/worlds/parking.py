@@ -59,6 +59,7 @@ class Faults(NamedTuple):
         noise_m: in each frame.
         partial: by how much the length of a far box is too short, as a share.
         flipped: share of headings that are the wrong way round.
+        odd: share of boxes that are seen with the size of any car, a drive long.
     """
 
     p_detect: float = 0.9
@@ -71,6 +72,7 @@ class Faults(NamedTuple):
     noise_m: float = 0.06
     partial: float = 0.1
     flipped: float = 0.05
+    odd: float = 0.0
 
 
 USUAL = Faults()
@@ -168,6 +170,10 @@ class Parking(NamedTuple):
         stamp_s = start_s + np.arange(len(path), dtype=np.float64) * STEP_S
         pose = upright(path)
         boxes, size, errors, class_id = self._around(rng, path, stamp_s, moving, faults)
+        if faults.odd > 0.0:
+            odd = np.flatnonzero(rng.uniform(size=len(size)) < faults.odd)
+            usual_m = np.array([SIZES_M[self.class_names[one]] for one in class_id[odd].tolist()]).reshape(-1, 3)
+            size[odd] = rng.normal(usual_m, SIZE_SPREAD_M)
         detections = _seen(rng, pose, boxes, size, class_id, errors, faults)
         odometry = _drifted(rng, pose, faults)
         odometry = se3.compose(se3.inverse(odometry[0]), odometry) if origin is None else se3.compose(origin, odometry)

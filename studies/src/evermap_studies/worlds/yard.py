@@ -6,14 +6,16 @@ nothing but the robot moves, and all else is the same: what it sees is worth wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import SlamConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
+from evermap.slam.plane import in_its_space
 from evermap.types import (
     BoolArray,
     FloatArray,
@@ -26,6 +28,7 @@ from evermap.types import (
     SpatialRecording,
     SpatialSensor,
     Trajectory,
+    is_in_space,
 )
 from evermap_studies.worlds.parking import upright
 
@@ -332,3 +335,10 @@ def _odometry(pose: FloatArray, config: YardConfig, rng: np.random.Generator) ->
     root = np.sqrt(STEP_S)
     by = np.array([config.drift_m, config.drift_m, 0.0, 0.0, 0.0, config.drift_rad]) * root
     return accumulate(se3.retract(step, by * rng.normal(size=(len(step), 6))))
+
+
+def flatten(recording: SpatialRecording) -> Recording:
+    """Return a drive in the plane: ranges and bearings of its tags, with what is stated of forklifts."""
+    found = in_its_space(replace(recording, objects=recording.objects[:0]), SlamConfig(plane=True))
+    assert not is_in_space(found)
+    return replace(found, objects=recording.objects)
