@@ -34,7 +34,10 @@ ALIGNERS = ("accept_alignment", "find_consensus", "rank_motions")
 
 def calls(path: Path, names: tuple[str, ...]) -> set[str]:
     """Which of some functions a module calls."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    if not any(name in text for name in names):
+        return set()  # most modules, which need not be parsed
+    tree = ast.parse(text)
     called = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call))
     return {func.id for func in called if isinstance(func, ast.Name)} & set(names)
 

@@ -9,9 +9,9 @@ import pytest
 from benchmarks import fuzz
 
 FILES = 40
-FEWER = 12
+FEWER = 8
 """Files of kinds that take long to read, in the quick tests."""
-LONG = ("bags", "models")
+LONG = ("bags", "models", "maps", "old-maps")
 """Beginnings of their names."""
 KINDS = [
     "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",

@@ -114,7 +114,7 @@ def radios(world: World) -> Recording:
     return replace(recording, detections=by_range, sensor=replace(recording.sensor, kind=SensorKind.UWB))
 
 
-@pytest.mark.parametrize("longer", [1.0 / 1.069, 1.07])
+@pytest.mark.parametrize("longer", [1.0 / 1.069, pytest.param(1.07, marks=pytest.mark.slow)])
 def test_a_map_says_that_ranges_are_of_another_scale(longer: float) -> None:
     world = World(seed=3, longer=longer)
     recording, survey = radios(world), world.map_in_plane()

@@ -35,7 +35,7 @@ def test_a_map_says_that_it_is_the_odometry(wheels: float) -> None:
     assert result.verdict.message.startswith(cause.message)
 
 
-@pytest.mark.parametrize("wheels", [LONG, 1.0 / LONG, 0.7])
+@pytest.mark.parametrize("wheels", [pytest.param(LONG, marks=pytest.mark.slow), 1.0 / LONG, 0.7])
 def test_without_a_map_lengths_are_those_of_the_ranges(wheels: float) -> None:
     """That ranges are off explains as much, and would stretch everything."""
     recording = World(seed=6, wheels=wheels).plane()

@@ -14,6 +14,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from evermap.geometry import square
 from evermap.geometry.camera import project, project_each, unproject
 from evermap.geometry.square import CORNERS, square_poses
 from evermap.types import SpatialSensor
@@ -141,6 +142,35 @@ def test_exact_corners_give_the_tag_back(camera: SpatialSensor) -> None:
     assert found.error_px[0].max() < 1e-6
     assert (found.error_px[1] >= found.error_px[0]).all()
     assert np.mean(apart(found.pose[0], found.pose[1])[1] > 0.1) > 0.7  # most views have a second explanation
+
+
+def test_poses_that_are_kept_are_those_of_the_same_corners_sizes_and_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What else a sensor has, as its mount, is nothing to them; what is kept cannot be spoilt."""
+    _, size, corner = tag_views(RADTAN, 5)
+    asked: list[SpatialSensor] = []
+    compute = square._square_poses
+    monkeypatch.setattr(square, "_square_poses", lambda *given: asked.append(given[2]) or compute(*given))
+    square._kept_poses.cache_clear()
+
+    def check(number: int, corner: np.ndarray, size: np.ndarray, sensor: SpatialSensor) -> None:
+        found = square_poses(corner, size, sensor)
+        assert len(asked) == number
+        for mine, theirs in zip(found, compute(corner, size, sensor), strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+
+    check(1, corner, size, RADTAN)
+    check(1, corner.copy(), size, replace(RADTAN, name="b", mount_robot_sensor=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+    check(2, corner, 2.0 * size, RADTAN)
+    check(3, corner[::-1], size[::-1], RADTAN)
+    check(4, corner, size, replace(RADTAN, distortion=()))
+    check(5, corner, size, replace(RADTAN, distortion_model="equidistant", distortion=RADTAN.distortion[:2]))
+    check(6, corner, size, replace(RADTAN, intrinsics=(500.0, 500.0, 320.0, 240.0)))
+    corner[0] += 0.5
+    check(7, corner, size, RADTAN)
+    with pytest.raises(ValueError, match="read-only"):
+        square_poses(corner, size, RADTAN).pose[:] = 0.0
+    monkeypatch.setattr(square, "_FEW", 4)
+    check(8, corner, size, RADTAN)
 
 
 def test_noisy_corners_give_the_least_reprojection_error() -> None:

@@ -125,7 +125,7 @@ def displacement_nees(seed: int, *, patrol_s: float) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_displacements_are_as_uncertain_as_they_are_told(seed: int) -> None:
     found = displacement_nees(seed, patrol_s=100.0)
     assert len(found) >= 6

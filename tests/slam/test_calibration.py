@@ -459,7 +459,7 @@ def test_a_turn_counts_and_the_jitter_of_its_report_does_not():
         assert beyond_jitter(np.arange(count) * 0.1, few[:count]).tolist() == few[:count].tolist()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_gyroscope_that_jitters_on_the_straight_says_nothing_of_its_scale(seed):
     """Down an aisle, round where nothing is seen, and back through another: the turn is as the odometry has it."""
     from benchmarks.harsh import simulate_copied_aisles

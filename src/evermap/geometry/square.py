@@ -7,6 +7,7 @@ are refined by Gauss-Newton on the pixels, damped after Levenberg and Marquardt.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -22,6 +23,8 @@ CORNERS = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5,
 `SpatialDetections.corner_px`: counter-clockwise from the lower left as one looks at it."""
 
 _STEPS = 20
+_FEW = 5000
+"""Squares of one call up to which its poses are kept: 700 bytes each."""
 
 
 class SquarePoses(NamedTuple):
@@ -41,9 +44,27 @@ class SquarePoses(NamedTuple):
 def square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSensor) -> SquarePoses:
     """Return the poses of square tags, with edges (M,), in the camera's frame.
 
-    Corners (M, 4, 2) are in the order of `SpatialDetections.corner_px`.
+    Corners (M, 4, 2) are in the order of `SpatialDetections.corner_px`. A run asks for the poses of the same corners
+    once for each cause that it considers, so those of the last calls are kept: they can't be written to.
     """
     corner_px, size_m = np.asarray(corner_px, dtype=np.float64), np.asarray(size_m, dtype=np.float64)
+    lens = SpatialSensor(
+        intrinsics=sensor.intrinsics, distortion=tuple(sensor.distortion), distortion_model=sensor.distortion_model
+    )
+    if len(size_m) > _FEW:
+        return _square_poses(corner_px, size_m, lens)
+    return _kept_poses(corner_px.tobytes(), size_m.tobytes(), lens)
+
+
+@functools.lru_cache(maxsize=16)
+def _kept_poses(corner_px: bytes, size_m: bytes, lens: SpatialSensor) -> SquarePoses:
+    found = _square_poses(np.frombuffer(corner_px).reshape(-1, 4, 2), np.frombuffer(size_m), lens)
+    for array in found:
+        array.flags.writeable = False
+    return found
+
+
+def _square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSensor) -> SquarePoses:
     ray = unproject(corner_px, sensor)
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(ray[..., 2:] > 0.0, ray[..., :2] / ray[..., 2:], np.nan)

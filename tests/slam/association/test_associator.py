@@ -46,6 +46,8 @@ from evermap_studies.sim.park import ParkConfig, simulate_park
 
 NAMELESS = SlamConfig(unknown_ids=True)
 KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False)
+FIRST_OF_THREE = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+"""Seeds, of which the quick tests try one."""
 
 
 def world(seed: int, **settings: float) -> World:
@@ -70,7 +72,7 @@ def test_a_small_world_is_sorted_out(seed: int) -> None:
     assert np.mean(row == NOBODY) < 0.02
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", FIRST_OF_THREE)
 def test_noise_of_the_odometry_is_learned_from_far_too_much(seed: int) -> None:
     made = make_world(seed, n_poses=400, n_landmarks=8, prior=KNOWN_SENSORS)
     associator = PlanarAssociator(
@@ -132,7 +134,7 @@ def in_slices_of(factors: int, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, constant, factors)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", FIRST_OF_THREE)
 def test_how_the_work_is_cut_changes_no_bit(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Slices are a constant of performance: neither a cost, nor an association, nor what names lead to depends on it.
 
@@ -180,7 +182,7 @@ def driven(world: World, settings: SlamConfig = NAMELESS) -> PlanarAssociator:
     return associator
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", FIRST_OF_THREE)
 def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Merged, split and realigned ones, whole searches, and what is only asked for: not a bit of what is held."""
     made = world(seed, p_outlier=0.05)
@@ -234,7 +236,7 @@ def test_wheels_that_did_not_slip_leave_the_filter_as_it_was(monkeypatch: pytest
     assert bits(asked) == bits(without)
 
 
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_trees_in_rows_are_kept(seed: int) -> None:
     """The noise of a merge that was rejected, taken over all the same, left 4 of the 60 trees of an orchard (4)."""
     recording = orchard(seed)
@@ -263,7 +265,9 @@ def check_orchard(kind: Orchard, seed: int, most_m: float) -> None:
     assert describe_doubts(evidence, NAMELESS.association) == ()
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("false", 2), ("false", 11), ("narrow", 18)])
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("false", 2), pytest.param("false", 11, marks=pytest.mark.slow), ("narrow", 18)]
+)
 def test_trees_are_kept_where_the_first_pass_goes_wrong(kind: str, seed: int) -> None:
     """It took a row for the next one, or closed no loop: what odometry alone leads to explains more."""
     check_orchard(KINDS[kind], seed, 0.05)
@@ -290,7 +294,7 @@ def test_rows_taken_for_the_next_bend_the_odometry() -> None:
     assert "50%" in dropped
 
 
-@pytest.mark.parametrize("sigma_tree_m", [0.0, 0.02])
+@pytest.mark.parametrize("sigma_tree_m", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
 def test_a_lattice_that_fits_shifted_by_one_tree_is_refused(sigma_tree_m: float) -> None:
     """In the middle of a row nothing says which tree is which: the result is in its own frame, and says so."""
     recording = orchard(0, replace(CASE, start_m=10.0, until_s=25.0, sigma_tree_m=sigma_tree_m))

@@ -107,7 +107,11 @@ def test_gain_of_displacements_is_the_difference_of_log_marginal_likelihoods(num
 
 @pytest.mark.parametrize(
     ("numbers", "label", "degrees"),
-    [(POINTS, [0, 1, 1, 0, 1, 0], 70.0), (PLACES, [0, 1, 1, 0, 1, 0], 50.0), (PLACES, [0, 0, 0, 1, 0, 0], 40.0)],
+    [
+        (POINTS, [0, 1, 1, 0, 1, 0], 70.0),
+        (PLACES, [0, 1, 1, 0, 1, 0], 50.0),
+        pytest.param(PLACES, [0, 0, 0, 1, 0, 0], 40.0, marks=pytest.mark.slow),
+    ],
 )
 def test_turning_group_against_a_sampled_integral(numbers: int, label: list[int], degrees: float) -> None:
     """The integral over motions is sampled around its peak, which scipy finds."""

@@ -144,7 +144,7 @@ def test_two_at_one_place_are_told_apart_by_a_column():
     np.testing.assert_array_equal(found(features=useless, feature_names=("colour",)), alone)
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5])
+@pytest.mark.parametrize("share", [0.2, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_points_of_which_some_have_names(share):
     recording = hall(1, n_points=40, n_frames=400, drift=0.1)
     true = recording.detections.landmark_id
@@ -283,7 +283,7 @@ def test_points_are_found_in_a_large_survey():
     assert all(name == real for name, real in named_as(drive, session.recording).items())
 
 
-@pytest.mark.parametrize("share", [0.05, 0.5])
+@pytest.mark.parametrize("share", [0.05, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_points_of_which_some_have_names_keep_them_over_sessions(share):
     whole, gone = hall(1, n_points=60, n_frames=400, step_s=0.6, drift=0.05), [3, 20, 41]
     named = np.random.default_rng(0).permutation(60)[: int(60 * share)]

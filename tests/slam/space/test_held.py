@@ -19,7 +19,7 @@ from .corridors import tagged_corridor
 
 
 @pytest.mark.parametrize("mapped", [False, True])
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_coarse_odometry_makes_no_sensor_suspect(seed: int, mapped: bool) -> None:
     """By steps as they were measured, tags 20 % smaller would gain 70 nats, and mounts 12."""
     world = tagged_corridor(seed, n_tags=16, n_frames=300, drift=0.02)

@@ -54,7 +54,7 @@ def within_chance(total: float, degrees: int) -> bool:
     return bool(low < total < high)
 
 
-@pytest.mark.parametrize("sigma_m", [0.005, 0.1])
+@pytest.mark.parametrize("sigma_m", [0.005, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_the_pose_is_as_uncertain_as_the_filter_says(sigma_m: float) -> None:
     """Also where the map is three times worse than the sensor, and wrong in the same way in every frame."""
     total, runs = 0.0, 12

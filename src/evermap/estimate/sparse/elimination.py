@@ -150,7 +150,7 @@ def eliminate_large(
         LinAlgError: it is not positive definite beyond rounding; the state is as before, but for its front.
     """
     own, size, n_waiting = int(tree.own[node]), int(tree.size[node]), int(state.n_waiting[0])
-    _gather(tree, factors, values, extra, state, node, LARGE_FACTOR)
+    _gather(tree, factors, values, extra, state, node, float(LARGE_FACTOR))  # an integer would compile it once more
     front = state.front[:size, : size + 1]
     mine = tree.factor[tree.factor_first[node] : tree.factor_first[node + 1]]
     for f in mine[factors.rows[mine] >= LARGE_FACTOR].tolist():
