@@ -204,7 +204,8 @@ def test_html_is_a_small_table(name: str) -> None:
 
 
 def test_every_type_with_columns_shows_itself() -> None:
-    found = [c for c in vars(types).values() if dataclasses.is_dataclass(c) and c.__module__.startswith(f"{types.__name__}.")]
+    home = f"{types.__name__}."
+    found = [c for c in vars(types).values() if dataclasses.is_dataclass(c) and c.__module__.startswith(home)]
     arrays = {c.__name__ for c in found if any("Array" in str(item.type) for item in dataclasses.fields(c))}
     assert {c.__name__ for c in found if issubclass(c, Shown)} >= arrays
     assert arrays <= OBJECTS.keys()
