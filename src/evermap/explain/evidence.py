@@ -185,7 +185,8 @@ def _in_space(session: SpatialSession) -> Optimum:
     nominal = start_noise(problem.settings, driven=problem.driven)
     odds = np.array(problem.settings.outlier_log_odds) if problem.robust else np.full(3, np.inf)
     seen = DetectionTerms(
-        (linear.residual**2).sum(axis=1), _log_peaks(problem, noise.levels), _log_peaks(problem, nominal.levels),
+        (linear.residual**2).sum(axis=1), _log_peaks(problem, noise.levels),
+        _log_peaks(problem.with_sigma_position(problem.usual_m), nominal.levels),
         odds[problem.kind], problem.share,
     )  # fmt: skip
     n, count, sigma = len(problem.stamp_s), len(problem.oriented), problem.start_sigma
