@@ -151,7 +151,7 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
     if smoother.heavy or smoother.robust != solved.settings.robust or smoother.noise is not noise:
         smoother = Smoother(problem, noise, robust=solved.settings.robust)
     graph, now = smoother.graph(state), smoother.linearised(state)
-    sigma = noise.of_detections(problem.sigma_given)
+    sigma = problem.find_sigma(noise)
     nominal = intake.beliefs(solved.recording.sensor, solved.settings)[1].of_detections(problem.sigma_given)
     residual = detection_residuals(problem, state) / sigma
     odds = noise.outlier_log_odds if solved.settings.robust else np.inf

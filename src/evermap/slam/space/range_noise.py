@@ -7,8 +7,8 @@ detector that knows sizes errs by a share of the range. So variances are sums of
 
 learned for each sensor as variance components by restricted maximum likelihood (Patterson and Thompson 1971). What the
 fit absorbed is taken as it was under the noise before (expectation-maximisation, as of the levels); imaginary residuals
-of a usual sensor of that level keep a shape that nothing shows as it usually is. Ranges are those of the solution: by
-measured ones, what is measured too short would count for more, and all lengths come out too short.
+of a usual sensor of that level keep a shape that nothing shows as it usually is. Which
+ranges these are: `estimate.noise.raise_ranges`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap.estimate.noise import restricted_level
+from evermap.estimate.noise import GAIN_NATS, fit_variances, gain_by_variances, raise_ranges
 from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, converged, leverages
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS
@@ -28,12 +28,8 @@ POWERS = (0, 2), (0, 2, 4)
 NUMBERS = 2.0, 1.0
 """That a position measures across the line of sight and along it."""
 ROUNDS, SETTLED = 4, 0.05
-"""Times that noise and values are sought in turns, at most, and change of the noise, relative and in the median, that
+"""Times that noise and values are sought in turns, at most, and relative change of the noise, a root mean square, that
 ends it."""
-STEPS = 100
-"""Multiplicative steps to the most probable components."""
-GAIN_NATS = 3.0
-"""That the noise by range of a sensor must gain over its noise before, for three numbers more (Akaike 1974)."""
 FARTHEST = 2.0
 """Ratio of expected and measured range up to which the former counts; where it is more the place is elsewhere."""
 
@@ -49,8 +45,8 @@ def with_range_noise(optimum: SpatialOptimum) -> SpatialOptimum:
             break
         before = problem.sigma_position_m * noise.levels[[ACROSS, ALONG]]
         found = learn_range_noise(optimum)
-        change = np.abs(np.log(found / before))[np.isfinite(problem.usual_m[:, 0])]
-        if np.median(change, axis=0).max() < SETTLED:
+        change = np.log(found / before)[np.isfinite(problem.usual_m[:, 0])]
+        if np.mean(change**2, axis=0).max() < SETTLED**2:
             break
         if np.isfinite(problem.usual_m[problem.kind != CORNERS]).all():
             noise = replace(noise, across=1.0, along=1.0)
@@ -68,6 +64,7 @@ def learn_range_noise(optimum: SpatialOptimum) -> FloatArray:
     explained = leverages(smoother, smoother.spread(now, nearly=True))[1]
     squares = now.weight[:, None] * now.residual**2 + explained
     expected = np.column_stack([squares[:, :2].sum(axis=1), squares[:, 2]]) * before**2
+    measured_m = np.linalg.norm(problem.measured[:, :3], axis=1)
     numbers, range_m, found = now.weight[:, None] * NUMBERS, _expect_ranges(optimum), before.copy()
     for sensor in range(len(problem.mount)):
         own = np.flatnonzero((problem.sensor == sensor) & np.isfinite(problem.usual_m[:, 0]))
@@ -75,29 +72,19 @@ def learn_range_noise(optimum: SpatialOptimum) -> FloatArray:
             continue
         fitted, gain = np.empty((len(own), 2)), 0.0
         for k, powers in enumerate(POWERS):
-            count, usual, pseudo = numbers[own, k], problem.usual_m[own, k] ** 2, problem.settings.pseudo_count
-            usual = usual * restricted_level((expected[own, k] / usual).sum(), count.sum(), 1.0, pseudo) ** 2
-            imagined = pseudo * count / count.sum()
-            variance = _fit_components(
-                range_m[own, None] ** np.array(powers), expected[own, k] + imagined * usual, count + imagined
+            count, usual = numbers[own, k], problem.usual_m[own, k] ** 2
+            usual = usual * (expected[own, k] / usual).sum() / count.sum()
+            imagined = problem.settings.pseudo_count * count / count.sum()
+            variance = fit_variances(
+                raise_ranges(powers, range_m[own], measured_m[own]),
+                expected[own, k] + imagined * usual,
+                count + imagined,
             )
             fitted[:, k] = np.sqrt(variance)
-            change = expected[own, k] * (before[own, k] ** -2 - 1.0 / variance)
-            change -= numbers[own, k] * np.log(variance / before[own, k] ** 2)
-            gain += 0.5 * float(problem.share[own] @ change)
+            gain += gain_by_variances(expected[own, k], count, before[own, k] ** 2, variance, problem.share[own])
         if gain > GAIN_NATS:
             found[own] = fitted
     return found
-
-
-def _fit_components(columns: FloatArray, squares: FloatArray, counts: FloatArray) -> FloatArray:
-    """Return the most probable variances (K,), sums of columns (K, P), of sums of squares (K,) of so many numbers."""
-    share = (squares.sum() / counts.sum()) / columns.mean(axis=0)
-    component: FloatArray = share / len(share)
-    for _ in range(STEPS):
-        variance = columns @ component
-        component *= ((squares / variance**2) @ columns) / ((counts / variance) @ columns)
-    return np.asarray(columns @ component)
 
 
 def _expect_ranges(optimum: SpatialOptimum) -> FloatArray:
