@@ -599,7 +599,9 @@ class SpaceConfig(Section):
         KINDS_IN_SPACE,
         "of a stated kind of sensor: standard deviation of the scale of its ranges, a share, and the next three keys",
     )
-    sigma_m: Positive = key(0.005, "noise of unstated positions at no range [m] ...")
+    sigma_m: Positive = key(
+        0.005, "noise of unstated positions at no range [m], to start from: it is learned by range ..."
+    )
     sigma_along: NotNegative = key(0.02, "... along the ray, as a share of the range ...")
     sigma_across: NotNegative = key(0.01, "... and across")
     sigma_rad: Positive = key(0.05, "standard deviation of an orientation that states none [rad]")

@@ -8,7 +8,7 @@ import pytest
 from evermap.config import Config
 from evermap.metrics.summary import compare_with_truth
 from evermap.pipeline import run_slam
-from evermap.slam.correlation import Lasting, lasting_errors
+from evermap.slam.correlation import Curve, Lasting, curve_columns, fit_curve, lasting_errors
 from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
 
 LANDMARKS, EACH, STEP_S = 30, 240, 0.25
@@ -77,3 +77,27 @@ def test_covariances_are_honest_where_a_visit_errs_alike():
     assert found.landmarks_anchored is not None
     assert 0.2 < np.mean(found.poses.anchored_nees) / 2.0 < 2.5
     assert 0.2 < np.mean(found.landmarks_anchored.nees) / 2.0 < 2.5
+
+
+def test_a_curve_that_takes_many_exchanges_is_fitted() -> None:
+    """Of a made drive; three steps of non-negative least squares a number, the default, end in a RuntimeError there."""
+    lag_s = np.array([0.4, 0.8, 1.2, 1.6, 2.8, 4.4, 6.8, 10.4, 14.8, 41.6, 52.8, 94.4])
+    square = np.array(
+        [0.00142, 0.00255, 0.00577, 0.00575, 0.006, 0.01078, 0.02796, 0.03114, 0.05613, 0.29674, 0.39646, 0.43702]
+    )
+    worth = np.array([75.0, 75.0, 75.0, 75.0, 60.2, 38.3, 24.8, 16.2, 11.4, 4.1, 3.2, 1.8])
+    curve, persist_s, growth = Curve(lag_s, square, worth), [1.0, 3.0, 10.0, 30.0, 100.0], 0.0018
+    found, log_likelihood = fit_curve(curve, persist_s, growth)
+    columns = np.column_stack(curve_columns(curve, persist_s))
+
+    def log_likelihood_of(parts: np.ndarray) -> float:
+        fitted = np.maximum(columns @ parts + growth * lag_s, 0.1 * square)
+        return float(worth @ (-np.log(fitted) - square / fitted))
+
+    assert (found >= 0.0).all()
+    assert log_likelihood == pytest.approx(log_likelihood_of(found))
+    for k in range(len(found)):  # no part that is a little larger or smaller is more probable
+        for by in (-0.1, 0.1):
+            other = found.copy()
+            other[k] = max(other[k] + by * max(found[k], 0.001), 0.0)
+            assert log_likelihood_of(other) < log_likelihood + 0.1

@@ -39,6 +39,54 @@ def restricted_level(squares: ArrayLike, count: ArrayLike, start: ArrayLike, pse
     return np.asarray(np.sqrt(total / (np.maximum(count, 0.0) + pseudo)))
 
 
+def fit_variances(columns: FloatArray, squares: FloatArray, counts: FloatArray) -> FloatArray:
+    """Return the most probable variances (K,), sums of columns (K, P) with weights that are not negative.
+
+    By multiplicative steps, as variance components are sought (`slam.noise`): they stay positive.
+
+    Args:
+        columns: shapes of the variance, none of them negative.
+        squares: (K,) sums of squares.
+        counts: (K,) of so many numbers each.
+    """
+    share: FloatArray = (squares.sum() / counts.sum()) / columns.mean(axis=0)
+    component = share / len(share)
+    for _ in range(STEPS):
+        variance = columns @ component
+        component = component * ((squares / variance**2) @ columns) / ((counts / variance) @ columns)
+    return np.asarray(columns @ component)
+
+
+def raise_ranges(powers: tuple[int, ...], expected_m: FloatArray, measured_m: FloatArray) -> FloatArray:
+    """Return (M, P) powers of ranges (M,), as they are shapes of the variance of what was measured there.
+
+    By measured ranges, what is measured too short would count for more, and all lengths come out too short. So ranges
+    are expected ones, but for one of four factors where the noise grows with the square: there an inverse range was
+    measured, a disparity or the size of an image. The score of its squared residual, by the range, is
+    `(1/m - 1/e) / e^2 = (e - m) / (e^3 m)`, and has no bias; by `e^4` lengths come out too long by the squared relative
+    noise.
+    """
+    columns = expected_m[:, None] ** np.array(powers, dtype=np.float64)
+    columns[:, np.array(powers) == 4] *= (measured_m / expected_m)[:, None]
+    return np.asarray(columns)
+
+
+def gain_by_variances(
+    squares: FloatArray, counts: FloatArray, before: FloatArray, after: FloatArray, share: FloatArray | float
+) -> float:
+    """Return the log likelihood that variances (K,) gain over those before, of sums of squares of so many numbers.
+
+    Of each a share (K,) is new.
+    """
+    return float(0.5 * np.sum(share * (squares * (1.0 / before - 1.0 / after) - counts * np.log(after / before))))
+
+
+STEPS = 100
+"""Multiplicative steps to the most probable variances."""
+GAIN_NATS = 3.0
+"""That a noise by range of up to three numbers more must gain over the noise before (Akaike 1974)."""
+
+
 class Turns(NamedTuple):
     """Rules of `alternate`.
 

@@ -151,7 +151,7 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
     if smoother.heavy or smoother.robust != solved.settings.robust or smoother.noise is not noise:
         smoother = Smoother(problem, noise, robust=solved.settings.robust)
     graph, now = smoother.graph(state), smoother.linearised(state)
-    sigma = noise.of_detections(problem.sigma_given)
+    sigma = problem.find_sigma(noise)
     nominal = intake.beliefs(solved.recording.sensor, solved.settings)[1].of_detections(problem.sigma_given)
     residual = detection_residuals(problem, state) / sigma
     odds = noise.outlier_log_odds if solved.settings.robust else np.inf
@@ -185,7 +185,8 @@ def _in_space(session: SpatialSession) -> Optimum:
     nominal = start_noise(problem.settings, driven=problem.driven)
     odds = np.array(problem.settings.outlier_log_odds) if problem.robust else np.full(3, np.inf)
     seen = DetectionTerms(
-        (linear.residual**2).sum(axis=1), _log_peaks(problem, noise.levels), _log_peaks(problem, nominal.levels),
+        (linear.residual**2).sum(axis=1), _log_peaks(problem, noise.levels),
+        _log_peaks(problem.with_sigma_position(problem.usual_m), nominal.levels),
         odds[problem.kind], problem.share,
     )  # fmt: skip
     n, count, sigma = len(problem.stamp_s), len(problem.oriented), problem.start_sigma

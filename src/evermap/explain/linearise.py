@@ -222,6 +222,7 @@ def _problem_of(session: SpatialSession, inputs: Inputs, undone: Inputs) -> Spat
         return None
     found = _with_measurements(problem, intake)
     longer = np.exp((undone.stretched - inputs.stretched)[before.used] / 3.0)
+    found = found.with_sigma_position(problem.sigma_position_m)  # as learned, where none is stated
     root = np.where((longer != 1.0)[:, None, None], problem.measured_root / longer[:, None, None], found.measured_root)
     return replace(found, measured_root=root, prior=prior)  # noise goes with what is stretched, stated or usual
 

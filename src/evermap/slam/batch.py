@@ -26,7 +26,7 @@ from evermap.geometry import se2, se3
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior, needed, seated
 from evermap.slam.method import Explanation, Method
-from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
+from evermap.slam.noise import Extrapolation, NoiseFit, learn_noise_by_range, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.smoother import COST_SLACK, DETECTIONS, Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -59,6 +59,8 @@ OTHER_METRE = 4.0
 """Standard deviations of range slope and odometer scale by which the metre of a map is another, at most."""
 NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.02
 """Change of the noise (`NoiseFit.change`) below which it is decided what is needed, and the last rounds stop."""
+NOISE_BY_RANGE_ROUNDS = 3
+"""Times that noise by range and values are sought in turns, at most."""
 FINAL_REVISIONS = 3
 """Times that the method thinks again at the end, at most: other places mean other noise, and that other gates."""
 
@@ -240,6 +242,9 @@ class Batch:
         if self._robust:
             rejoined = _rejoined(found.smoother, found.estimate, self._settings)
             found = self._readmitted(found, rejoined)
+        found = self._with_noise_by_range(found)
+        problem = found.smoother.problem
+        if self._robust:
             tried = found.smoother.inlier_probability(found.estimate) < 0.5
         problem, estimate = self._ahead(problem, found.estimate, aligned=aligned)
         for _ in range(FINAL_REVISIONS):
@@ -268,6 +273,19 @@ class Batch:
             marginals = found.marginals if turn < SAME_FRAME else smoother.marginals(estimate)
             solved = smoother, estimate, marginals
         return divided(solved, self._prior, p_needed, found.noise, revision, aligned=aligned)
+
+    def _with_noise_by_range(self, found: FoundOptimum) -> FoundOptimum:
+        """Return what was found with noise by range of detections that state none."""
+        asked = self._estimate_noise and found.smoother.problem.noise_by_range
+        for _ in range(NOISE_BY_RANGE_ROUNDS if asked else 0):
+            smoother, estimate = found.smoother, found.estimate
+            weights, before = smoother.inlier_probability(estimate), smoother.problem
+            share = float(before.new_information(smoother.lasting(estimate)).mean())
+            problem, noise = learn_noise_by_range(before, estimate, found.marginals, weights, smoother.noise, share)
+            if problem is before:
+                break
+            found = self._settled(smoother, problem, estimate, noise, ahead=found.ahead)
+        return found
 
     def _readmitted(
         self, found: FoundOptimum, estimate: Estimate, tried: BoolArray | None = None, *, final: bool = False

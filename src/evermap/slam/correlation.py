@@ -37,6 +37,8 @@ ROUNDS_OF_FIT, LEAST_OF_SQUARE = 6, 0.1
 PERSISTS = 2.0
 """Nats a curve by which errors that persist must explain all curves better than white ones: of two numbers more for
 each of them (Akaike 1974)."""
+MOST_SWAPS = 1000
+"""Steps of least squares of numbers that aren't negative: three for each, as is the default, aren't always enough."""
 LEAST_WEIGHT = 0.5
 """Inlier probability from which a residual counts."""
 
@@ -259,6 +261,6 @@ def fit_curve(curve: Curve, persist_s: tuple[float, ...] | list[float], growth: 
     found, fitted = np.zeros(columns.shape[1]), curve.square
     for _ in range(ROUNDS_OF_FIT):
         weight = np.sqrt(curve.worth) / fitted
-        found, _ = nnls(columns * weight[:, None], (curve.square - known) * weight)
+        found, _ = nnls(columns * weight[:, None], (curve.square - known) * weight, maxiter=MOST_SWAPS)
         fitted = np.maximum(columns @ found + known, LEAST_OF_SQUARE * curve.square)
     return found, float(curve.worth @ (-np.log(fitted) - curve.square / fitted))

@@ -104,6 +104,7 @@ def prepare(
         landmark_mean=np.zeros((len(landmark_id), 2)),
         landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
         measurements=tuple(of for of in seen.measurements if of.kind.frame is None),
+        noise_by_range=recording.sensor.measures_positions and recording.sensor.sigma_range_m is None,
     )
     framed = tuple(of for of in seen.measurements if of.kind.frame is not None)
     in_map = None if prior_map is None else place_map(prior_map, landmark_id)

@@ -265,6 +265,7 @@ def _floor_sensor(recording: SpatialRecording, mount: FloatArray, bearing: Float
         sigma_angle_rad=most("sigma_angle_rad"),
         sigma_position_m=most("sigma_position_m"),
         sigma_odometer_scale=recording.sensors[0].sigma_odometer_scale,
+        measures_positions=True,
     )
 
 

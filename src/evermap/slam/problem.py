@@ -195,9 +195,12 @@ class Problem(BaseProblem):
             Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
             array is taken, too.
         share: (M,) of the information of each detection that is new; None where all of it is.
+        noise_shape: (M, 2) standard deviations over the noise levels, by the range, where none came with a detection;
+            None where these are all alike.
+        noise_by_range: whether that is sought.
     """
 
-    COLUMNS = ("pose_row", "landmark_row", "reading", "sigma_given", "share")
+    COLUMNS = ("pose_row", "landmark_row", "reading", "sigma_given", "share", "noise_shape")
 
     drive: Drive
     landmark_row: IntArray
@@ -210,6 +213,8 @@ class Problem(BaseProblem):
     landmark_mean: FloatArray
     landmark_information: sparse.csr_array
     share: FloatArray | None = None
+    noise_shape: FloatArray | None = None
+    noise_by_range: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
@@ -228,6 +233,11 @@ class Problem(BaseProblem):
     def has_bearing(self) -> BoolArray:
         """(M,) detections whose bearing was measured; of the others it says nothing of where the landmark is."""
         return np.asarray(~(self.sigma_given[:, 1] >= ANY_BEARING_RAD))
+
+    def find_sigma(self, noise: Noise) -> FloatArray:
+        """Return (M, 2) standard deviations of the detections: their own where they came with one."""
+        learned = noise.detection if self.noise_shape is None else noise.detection * self.noise_shape
+        return np.where(np.isfinite(self.sigma_given), self.sigma_given, learned)
 
     def with_places(self, count: int) -> Problem:
         """Return the problem with room for so many places; new ones have no prior."""

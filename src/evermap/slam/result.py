@@ -224,7 +224,7 @@ def online(solved: Solved, frame: str) -> Trajectory:
 def _innovations(solved: Solved) -> Innovations:
     """Return the NIS of all detections, each as if it had not been used; none of those that say all of a landmark."""
     outcome, detections, problem = solved.outcome, solved.recording.detections, solved.outcome.problem
-    sigma = outcome.noise.noise.of_detections(problem.sigma_given)
+    sigma = problem.find_sigma(outcome.noise.noise)
     used = outcome.fit_marginals.explained_detections
     left = np.eye(2) - used
     told = np.flatnonzero(np.trace(left, axis1=1, axis2=2) > LEAST_LEFT)

@@ -187,7 +187,7 @@ class Smoother(Solver[Estimate]):
         """
         graph, now, count = self.graph(estimate), self.linearised(estimate), value.shape[1]
         system, where = graph.structure.system, graph.structure.values_of(DETECTIONS)
-        seen, sigma = self.detections(estimate), self.noise.of_detections(self.problem.sigma_given)
+        seen, sigma = self.detections(estimate), self.problem.find_sigma(self.noise)
         share = 1.0 if self.problem.share is None else self.problem.share
         by_curve = np.zeros((len(seen), 2, count))
         by_curve[:, 0] = -(np.sqrt(now.weights[DETECTIONS] * share) / sigma[:, 0])[:, None] * value
@@ -205,7 +205,7 @@ class Smoother(Solver[Estimate]):
         """Return how long errors of detections last, by the residuals there; the last answer is kept."""
         if self._lasting is not None and self._lasting[0] is estimate:
             return self._lasting[1]
-        problem, sigma = self.problem, self.noise.of_detections(self.problem.sigma_given)
+        problem, sigma = self.problem, self.problem.find_sigma(self.noise)
         residual = detection_residuals(problem, estimate) / np.where(sigma < ANY_BEARING_RAD, sigma, np.nan)
         found = problem.lasting(residual, self.inlier_probability(estimate))
         self._lasting = estimate, found
@@ -274,7 +274,7 @@ class Smoother(Solver[Estimate]):
             problem.pose_row,
             rank[problem.landmark_row],
             problem.reading,
-            noise.of_detections(problem.sigma_given),
+            problem.find_sigma(noise),
             np.ones(len(problem.pose_row)) if problem.share is None else problem.share,
             problem.mount,
             problem.prior.free,

@@ -49,6 +49,7 @@ class Sensor:
             as usual for the kind.
         sigma_odometer_scale: standard deviation of the scale of the odometer; sigma_askew_rad: of the direction in
             which the robot drives, from its front. None: unknown.
+        measures_positions: whether ranges and bearings are those of positions, of whatever sensor in space.
     """
 
     range_min_m: float = 0.0
@@ -67,6 +68,7 @@ class Sensor:
     sigma_position_m: float | None = None
     sigma_odometer_scale: float | None = None
     sigma_askew_rad: float | None = None
+    measures_positions: bool = False
 
     @property
     def states_scale(self) -> bool:

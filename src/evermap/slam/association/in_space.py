@@ -58,11 +58,6 @@ FAR_M = 1e3
 """Standard deviation of the position of a landmark before its first detection: uninformative."""
 ROUNDS = 2
 """Rounds of learning the noise with a kernel whose influence never vanishes, as far from convergence."""
-OF_DETECTIONS = (
-    "pose_row", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root", "half_m", "other",
-    "other_log_odds", "share", "ray",
-)  # fmt: skip
-"""Columns of `SpatialProblem` with one row per detection."""
 
 
 def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False) -> Associated:
@@ -399,12 +394,11 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
     def _problem_of(self, row: IntArray) -> SpatialProblem:
         """The measurements of landmarks (M,)."""
         problem, used = self._problem, np.flatnonzero(row >= 0)
-        some = {name: getattr(problem, name)[used] for name in OF_DETECTIONS}
         first = np.unique(row[used], return_index=True)[1]
         turned = np.zeros(len(first), dtype=np.bool_)
         turned[row[used][self._turned[used]]] = True
         symmetries = problem.symmetries[problem.place[used[first]]]
-        return replace(problem, **some, place=row[used], oriented=turned, symmetries=symmetries)
+        return replace(problem.seeing(used), place=row[used], oriented=turned, symmetries=symmetries)
 
     def _solved(self, start: SpatialAssignment) -> SpatialSolution:
         """Solve for landmarks, from poses that may be far off: positions first, then orientations, too."""

@@ -179,7 +179,7 @@ def parting_time(
     if len(mine) < 2:
         return within_s[1], within_s
     column = np.searchsorted(members, problem.landmark_row[mine])
-    sigma = noise.of_detections(problem.sigma_given[mine])
+    sigma = problem.find_sigma(noise)[mine]
     loss = np.empty((2, len(mine)))
     for k, place in enumerate((old, new)):
         _losses(

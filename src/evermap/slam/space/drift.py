@@ -31,6 +31,7 @@ from evermap.slam.correlation import (
     FEWEST_BINS,
     FEWEST_PAIRS,
     MOST_LAGS,
+    MOST_SWAPS,
     PERSIST_S,
     PERSISTS,
     Curve,
@@ -160,7 +161,7 @@ def _least_growth(curve: Curve) -> float:
     from scipy.optimize import nnls
 
     columns = np.column_stack([*curve_columns(curve, PERSIST_S[:-2]), curve.lag_s])
-    found, _ = nnls(columns / curve.square[:, None], np.ones(len(curve.lag_s)))
+    found, _ = nnls(columns / curve.square[:, None], np.ones(len(curve.lag_s)), maxiter=MOST_SWAPS)
     return float(found[-1])
 
 

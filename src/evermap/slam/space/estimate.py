@@ -107,7 +107,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
     if not problem.estimate_noise:
         return noise
     n_steps, spread, worth = len(problem.increment), smoother.spread(now, nearly=True), problem.settings.pseudo_count
-    of_steps, of_detections = _leverages(smoother, spread)
+    of_steps, of_detections = leverages(smoother, spread)
     levels = noise.levels.copy()
 
     def learn(level: int, squares: float, numbers: float, leverage: float) -> None:
@@ -155,9 +155,10 @@ def correlation(optimum: SpatialOptimum) -> float:
     return float((before * after).sum()) / total if total > 0.0 else 0.0
 
 
-def _leverages(smoother: SpatialSmoother, spread: Spread) -> tuple[FloatArray, FloatArray]:
-    """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are: leverages,
-    which are in [0, 1] but for rounding.
+def leverages(smoother: SpatialSmoother, spread: Spread) -> tuple[FloatArray, FloatArray]:
+    """Return diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8), weighted as the Jacobians are.
+
+    These are leverages, in [0, 1] but for rounding.
     """
     n_steps, kind = len(smoother.problem.increment), smoother.problem.kind
     found = np.zeros((len(kind), 8))

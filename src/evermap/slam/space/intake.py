@@ -148,6 +148,7 @@ def prepare_space(
         kind=some.kind,
         measured=some.measured,
         measured_root=_roots(some.covariance, some.measured[:, :3]),
+        usual_m=some.usual_m,
         sigma_rad=some.sigma_rad,
         corner=some.corner,
         corner_root=some.corner_root,
@@ -279,6 +280,7 @@ class _Where:
     kind: IntArray
     measured: FloatArray
     covariance: FloatArray
+    usual_m: FloatArray
     sigma_rad: FloatArray
     corner: FloatArray
     corner_root: FloatArray
@@ -291,13 +293,14 @@ def _where(
 ) -> tuple[_Where, BoolArray]:
     """Return the measurements, and the usable detections without any; `coarse` as for `prepare_space`."""
     given = recording.detections
-    count = len(given)
+    count, covariance, usual_m = len(given), *_covariance(recording, settings)
     found = _Where(
         kind=np.where(np.isfinite(given.rotation[:, 0]), POSE, POINT).astype(np.int64),
         measured=np.hstack(
             [given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, se3.NO_TURN)]
         ),
-        covariance=_covariance(recording, settings),
+        covariance=covariance,
+        usual_m=usual_m,
         sigma_rad=_sigma_rad(recording, settings.sigma_rad),
         corner=np.zeros((count, 4, 2)),
         corner_root=np.zeros((count, 4, 2, 2)),
@@ -395,7 +398,7 @@ def _put(
     """Enter tags that are seen by their corners."""
     good = np.isfinite(poses.pose[0]).all(axis=1)
     rows = rows[good]
-    found.kind[rows] = CORNERS
+    found.kind[rows], found.usual_m[rows] = CORNERS, np.nan
     found.corner[rows], found.corner_root[rows] = plane[good, :, :2], slope[good, :, :, :2]
     found.measured[rows], found.other[rows] = poses.pose[0][good], poses.pose[1][good]
     covariance = np.linalg.pinv(poses.information[0][good], hermitian=True)
@@ -413,14 +416,17 @@ def _put_coarsely(found: _Where, rows: IntArray, plane: FloatArray, slope: Float
     at = plane.mean(axis=1) * (size_m / np.maximum(edge, 1e-12))[:, None]
     good = np.isfinite(at).all(axis=1)
     rows = rows[good]
-    found.kind[rows] = CORNERS
+    found.kind[rows], found.usual_m[rows] = CORNERS, np.nan
     found.corner[rows], found.corner_root[rows] = plane[good, :, :2], slope[good, :, :, :2]
     found.measured[rows] = se3.identity(len(rows))
     found.measured[rows, :3], found.covariance[rows], found.sigma_rad[rows] = at[good], np.eye(3), 1.0
 
 
-def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArray:
-    """Return (M, 3, 3) covariances of positions: as given, or usual ones of such sensors."""
+def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> tuple[FloatArray, FloatArray]:
+    """Return (M, 3, 3) covariances of positions: as given, or usual ones of such sensors.
+
+    And (M, 2) standard deviations of the latter across and along the line of sight, nan of those that are given.
+    """
     given = recording.detections
     at = given.position_sensor_m
     range_m = np.maximum(np.linalg.norm(at, axis=1), settings.nearest_m)
@@ -434,7 +440,9 @@ def _covariance(recording: SpatialRecording, settings: SpaceConfig) -> FloatArra
     stated = np.array([np.nan if sensor.sigma_m is None else sensor.sigma_m for sensor in recording.sensors])
     of_sensor = stated[given.sensor][:, None, None] ** 2 * np.eye(3)
     usual = np.where(np.isfinite(of_sensor), of_sensor, usual)
-    return np.where(np.isfinite(given.covariance_sensor_m2), given.covariance_sensor_m2, usual)
+    found = np.where(np.isfinite(given.covariance_sensor_m2), given.covariance_sensor_m2, usual)
+    is_given = np.isfinite(stated[given.sensor]) | np.isfinite(given.covariance_sensor_m2).any(axis=(1, 2))
+    return found, np.where(is_given[:, None], np.nan, np.column_stack([across, along]))
 
 
 def _sigma_rad(recording: SpatialRecording, usual: float) -> FloatArray:

@@ -192,6 +192,8 @@ class SpatialProblem(BaseProblem):
         place, sensor, kind: (M,) which place each detection is of, and how it was seen.
         measured: (M, 7) the place in the sensor's frame.
         measured_root: (M, 3, 3) whitens the position but for its noise levels; see `SpatialSightings`.
+        usual_m: (M, 2) standard deviations across and along the line of sight that positions usually have, where none
+            is stated; nan of others.
         sigma_rad: (M,) of the orientation, but for its noise level.
         corner, corner_root, half_m: of tags in an image; see `SpatialSightings`.
         other: (M, 7) the other orientation that explains the corners, with its position; nan where there is none.
@@ -223,8 +225,8 @@ class SpatialProblem(BaseProblem):
     """
 
     COLUMNS = (
-        "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
-        "half_m", "other", "other_log_odds", "share", "ray",
+        "pose_row", "place", "sensor", "kind", "measured", "measured_root", "usual_m", "sigma_rad", "corner",
+        "corner_root", "half_m", "other", "other_log_odds", "share", "ray",
     )  # fmt: skip
 
     increment: FloatArray
@@ -236,6 +238,7 @@ class SpatialProblem(BaseProblem):
     kind: IntArray
     measured: FloatArray
     measured_root: FloatArray
+    usual_m: FloatArray
     sigma_rad: FloatArray
     corner: FloatArray
     corner_root: FloatArray
@@ -294,6 +297,16 @@ class SpatialProblem(BaseProblem):
         factor = wanted_m / np.linalg.norm(self.measured[:, :3], axis=1)
         found[some, :3] *= factor[some, None]
         return replace(self, measured=found, range_error=error)
+
+    @property
+    def sigma_position_m(self) -> FloatArray:
+        """Return (M, 2) standard deviations across and along the line of sight, but for their noise levels."""
+        return 1.0 / np.asarray(np.linalg.norm(self.measured_root[:, [0, 2]], axis=2))
+
+    def with_sigma_position(self, sigma_m: FloatArray) -> SpatialProblem:
+        """Return the problem with other standard deviations (M, 2) of positions of which none is stated."""
+        factor = np.where(np.isfinite(self.usual_m), self.sigma_position_m / sigma_m, 1.0)
+        return replace(self, measured_root=self.measured_root * factor[:, [0, 0, 1], None])
 
     @property
     def range_slope(self) -> FloatArray:
@@ -383,6 +396,7 @@ class SpatialProblem(BaseProblem):
             measured=se3.scaled(self.measured, shorter),
             other=se3.scaled(self.other, shorter),
             measured_root=self.measured_root / shorter,
+            usual_m=self.usual_m * shorter,
             half_m=self.half_m * shorter,
             increment=se3.scaled(self.increment, longer),
             swing=self.swing.scaled(longer),

@@ -63,8 +63,8 @@ DIVIDED = (
 _LEVELS = {
     TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),
     ROTATION: ("sigma_odometry_rad", "rad/sqrt(s)", "noise of the odometry's rotation"),
-    ACROSS: ("direction_noise_factor", "1", "noise of positions across the line of sight over what is stated"),
-    ALONG: ("range_noise_factor", "1", "noise of ranges over what is stated"),
+    ACROSS: ("direction_noise_factor", "1", "noise of positions across the line of sight over what is stated or usual"),
+    ALONG: ("range_noise_factor", "1", "noise of ranges over what is stated or usual"),
     ORIENTATION: ("orientation_noise_factor", "1", "noise of detected orientations over what is stated"),
     PIXEL: ("sigma_corner_px", "px", "noise of tag corners in the image"),
 }
@@ -257,7 +257,9 @@ def _sizes(told: _Told, count: int) -> FloatArray:
 def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     optimum, problem = told.solved.optimum, told.problem
     started = start_noise(problem.settings, driven=problem.driven)
-    found = noise_parameters(optimum.noise, started, problem.kind, problem.ray, driven=problem.driven)
+    found = noise_parameters(
+        _over_usual(optimum.noise, problem), started, problem.kind, problem.ray, driven=problem.driven
+    )
     border = optimum.smoother.factorised(optimum.now).border_covariance()
     *of_sensors, of_scale = np.sqrt(np.diag(border))
     sigma = np.reshape(of_sensors, (-1, STATES))
@@ -276,6 +278,20 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
     if problem.scale_sigma > 0.0:
         found += _scales(told, float(of_scale))
     return tuple(found)
+
+
+def _over_usual(noise: SpatialNoise, problem: SpatialProblem) -> SpatialNoise:
+    """Return levels over what is stated, or is usual where nothing is: those by which all positions together would be
+    worth as much as with the noise by range that was learned.
+    """
+    free = np.isfinite(problem.usual_m)
+    if not free.any():
+        return noise
+    own = problem.kind != CORNERS
+    sigma_m = problem.sigma_position_m[own]
+    usual_m = np.where(free[own], problem.usual_m[own], sigma_m)
+    across, along = np.sqrt(np.sum(usual_m**-2, axis=0) / np.sum(sigma_m**-2, axis=0)).tolist()
+    return replace(noise, across=across * noise.across, along=along * noise.along)
 
 
 def noise_parameters(

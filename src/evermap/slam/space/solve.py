@@ -42,6 +42,7 @@ from evermap.slam.space.map_consensus import cost_in_map, start_by_consensus
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_within import MovedWithin, list_movers, superseded
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.range_noise import with_range_noise
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.starts import by_constellations, lost_frames
@@ -163,10 +164,10 @@ def solve_space(
             begun = _or_best(begun, by_constellations(problem, noise, SEEDS))
         estimate, noise = begun.estimate, begun.noise
     problem, estimate = _in_measured_frame(problem, estimate, framed)
-    optimum, delays = with_delays(converged(problem, estimate, noise))
+    optimum, delays = with_delays(with_range_noise(converged(problem, estimate, noise)))
     if len(stated) and of_points and not problem.driven and (_is_doubtful(optimum) or has_contradictions(optimum)):
         optimum = _or_by_consensus(optimum, stated)
-    optimum = repaired(optimum)
+    optimum = with_range_noise(repaired(optimum))
     if scale_in_map > 0.0:
         optimum = _with_scale_of_map(optimum, scale_in_map)
     problem = optimum.smoother.problem
@@ -273,7 +274,9 @@ def _with_drift(
     elif drift.translation is not None and drift.rotation is not None:
         free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
         start = first_places(free, driven)
-        alone = converged(free, start, noise)
+        alone = with_range_noise(converged(free, start, noise))
+        free = alone.smoother.problem
+        problem = problem.with_sigma_position(free.sigma_position_m)
         of_metre = in_map or _is_of_one_metre(alone.estimate, driven)
         if of_metre and _are_independent(alone, drift.translation):
             return problem, replace(alone.noise, pixel=noise.pixel), None, None
