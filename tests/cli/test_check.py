@@ -132,3 +132,17 @@ def test_a_camera_that_was_on_for_a_moment_has_no_other_unit(tmp_path: Path) -> 
     burst = replace(patrol(), frames=replace(patrol().frames, stamp_s=seen_s), odometry=driven)
     told = run("check", write_native(burst, tmp_path / "recording"), "--quick")
     assert "stamps of the" not in told.stderr
+
+
+@pytest.mark.parametrize("verb", ["check", "slam"])
+def test_ranges_alone_are_detections(verb: str, tmp_path: Path) -> None:
+    folder = write_native(patrol(), tmp_path / "uwb")
+    rows = [row.split(",")[:3] for row in (folder / "detections.csv").read_text("utf-8").splitlines()]
+    assert rows[0] == ["stamp_s", "landmark_id", "range_m"]
+    (folder / "ranges.csv").write_text("\n".join(map(",".join, rows)), encoding="utf-8")
+    (folder / "detections.csv").unlink()
+    options: list[str | Path] = ["--out", tmp_path / "out"] if verb == "slam" else []
+    refused = run(verb, folder, *options)
+    assert refused.exit_code == 2
+    assert "ranges are detections where nothing else is seen" in refused.stderr
+    assert "kind = 'uwb'" in refused.stderr
