@@ -374,7 +374,7 @@ def test_a_recording_without_identities(column: str, in_space: bool, tmp_path: P
         texts.append(",".join(cells))
     (folder / "detections.csv").write_text("\n".join(texts), encoding="utf-8")
     checked, refused = run("check", folder), run("slam", folder, "--out", tmp_path / "out")
-    assert (checked.exit_code, refused.exit_code) == (0, 2)
+    assert (checked.exit_code, refused.exit_code) == (2, 2)
     for result in (checked, refused):
         [line] = result.stderr.strip().splitlines()
         assert "--unknown-ids associates detections without a landmark_id" in line

@@ -1,9 +1,9 @@
-"""`evermap check`: a summary of a recording and its problems, before anything is estimated."""
+"""`evermap check`: a summary of a recording, its problems, and the verdict that `evermap slam` would end with."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,8 +18,29 @@ from evermap.cli.options import (
     argument,
     associated,
     configured,
+    option,
 )
-from evermap.cli.terminal import EXIT_UNTRUSTWORTHY, fail, print_json, print_table, remark_as, say, warn
+from evermap.cli.terminal import (
+    EXIT_UNTRUSTWORTHY,
+    echo,
+    fail,
+    print_json,
+    print_table,
+    progress_bar,
+    remark_as,
+    say,
+    warm_up_for,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from evermap.config import Config
+    from evermap.types import AnyRecording, Verdict
+
+EXIT_REFUSED = 2
+"""Of a recording that nothing can be estimated from."""
+UNASKED = "not asked by --quick: mounts, scales, delays below a second, mixed identities (try: without --quick)"
+"""What the readings alone cannot tell."""
 
 
 def check(
@@ -29,43 +50,80 @@ def check(
     settings: Settings = None,
     unknown_ids: UnknownIds = False,
     empty_ids: EmptyIds = False,
+    quick: Annotated[bool, option("--quick", "Look at the readings alone, without a solution.")] = False,
     show_config: ShowConfig = False,
     as_json: AsJson = False,
 ) -> None:
     """Check whether a recording is usable, and report problems.
 
-    Checks units, signs, clocks, gaps, jumps, rates, identities, limits and coverage. Exit code 0: usable, possibly with
-    warnings; 3: unusable, each reason in one line, as `evermap slam` ends with; 2: it cannot be read.
+    Checks units, signs, clocks, gaps, jumps, rates, identities, limits and coverage; then solves the recording, unless
+    that shows it to be unusable, and ends with the verdict and the exit code of `evermap slam`; nothing is written.
+    Exit code 0: usable, possibly with warnings; 3: not to be trusted, each reason in one line; 2: it cannot be read, or
+    nothing can be estimated from it.
 
     \b
     Examples:
       evermap check my-recording
       evermap check MRCLAM_Dataset6.zip --robot 1 --json
       evermap check my-recording --unknown-ids
-      evermap check monday.mcap
+      evermap check monday.mcap --quick
     """
     given = {"slam.unknown_ids": associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam.check", also=["sensor"], show=show_config)
-    from evermap.config import SlamConfig, refuse_unread
     from evermap.io import read_recording
+    from evermap.runs.summary import verdict_dict
     from evermap.slam.check import check_recording
 
-    reads = ("check", "cleaning", "space", "plane", "unknown_ids")
-    unread = [f"slam.{name}" for name in SlamConfig.model_fields if name not in reads]
-    refuse_unread(settings or [], {"by this command": unread}, within="slam.check")
-    found = check_recording(read_recording(input, robot=robot), chosen)
-    if as_json:
-        print_json(found.as_dict())
-    else:
+    if quick:
+        _refuse_unread(settings)
+    recording = read_recording(input, robot=robot)
+    found = check_recording(recording, chosen)
+    if not as_json:
         print_table(found.name, content_rows(found.contents))
     for remark in found.warnings:
         warn(remark)
     for finding in found.findings:
         (warn if finding.usable else fail)(remark_as.get()(finding.message))
-    if not found.usable:
-        raise typer.Exit(EXIT_UNTRUSTWORTHY)
-    if not found.warnings and not found.findings:
+    verdict = None if quick or not found.usable else find_verdict(recording, chosen)
+    usable = found.usable and (verdict is None or verdict.kind.is_trustworthy)
+    if as_json:
+        print_json({**found.as_dict(), "usable": usable, "verdict": None if verdict is None else verdict_dict(verdict)})
+    elif verdict is not None:
+        echo(f"verdict: {verdict.text}")
+    if usable and not found.warnings and not found.findings:
         say("no problems found")
+    if quick and usable:
+        say(UNASKED)
+    if found.is_refused:
+        raise typer.Exit(EXIT_REFUSED)
+    if not usable:
+        raise typer.Exit(EXIT_UNTRUSTWORTHY)
+
+
+def find_verdict(recording: AnyRecording, config: Config) -> Verdict | None:
+    """Return the verdict that `evermap slam` ends with, without a map.
+
+    Raises:
+        EvermapError: nothing can be estimated.
+    """
+    from evermap.pipeline import run_slam
+    from evermap.slam.plane import with_prior
+
+    recording, _, _ = with_prior(recording, None, config.slam)
+    warm_up_for(recording, config)
+    with progress_bar(recording.name) as progress:
+        result = run_slam(recording, config, progress=progress)
+    if result.interrupted:
+        raise KeyboardInterrupt
+    return result.verdict
+
+
+def _refuse_unread(settings: list[str] | None) -> None:
+    from evermap.config import SlamConfig, refuse_unread
+
+    reads = ("check", "cleaning", "space", "plane", "unknown_ids")
+    unread = [f"slam.{name}" for name in SlamConfig.model_fields if name not in reads]
+    refuse_unread(settings or [], {"with --quick": unread}, within="slam.check")
 
 
 def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:

@@ -38,6 +38,7 @@ from evermap.cli.terminal import (
     progress_bar,
     say,
     warm_up,
+    warm_up_for,
     warn,
 )
 from evermap.errors import ConfigError, DataError, EvermapError
@@ -350,26 +351,18 @@ def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, aske
 
     A run interrupted by Ctrl-C is written as far as it got.
     """
-    from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
-    from evermap.slam.changes.joint import may_search
     from evermap.slam.plane import with_prior
     from evermap.slam.space.moving import has_traffic
     from evermap.types import is_in_space
 
-    unknown_ids = asked.config.slam.unknown_ids
     recording, prior, _ = with_prior(recording, prior, asked.config.slam)
     in_space = is_in_space(recording)
     _refuse_unread(asked, in_space=in_space, boxes=has_traffic(recording))
-    if in_space:
-        if asked.realtime:
-            problem = "all frames of a recording in space are solved together"
-            raise ConfigError(problem, field="realtime", hint="leave it out")
-        traffic = has_traffic(recording)
-        warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=unknown_ids))
-    else:
-        search = may_search(len(recording.frames.stamp_s), in_map=prior is not None)
-        warm_up(lambda: compile_kernels(search=search, unknown_ids=unknown_ids))
+    if in_space and asked.realtime:
+        problem = "all frames of a recording in space are solved together"
+        raise ConfigError(problem, field="realtime", hint="leave it out")
+    warm_up_for(recording, asked.config, in_map=prior is not None)
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, asked.config, prior_map=prior, realtime=asked.realtime, progress=progress)

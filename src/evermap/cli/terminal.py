@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Console
 
-    from evermap.types import Progress
+    from evermap.config import Config
+    from evermap.types import AnyRecording, Progress
 
 SUFFIXES = (".png", ".svg")
 """Of pictures."""
@@ -108,6 +109,21 @@ def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
     note = "compiling the kernels, once on this machine; this takes up to a minute"
     with at_first_missing(lambda: say(note)):
         compile_kernels()
+
+
+def warm_up_for(recording: AnyRecording, config: Config, *, in_map: bool = False) -> None:
+    """Compile what `pipeline.run_slam` needs for a recording, in the plane or in space as it is solved."""
+    from evermap.cli.warmup import warm_up as compile_kernels
+    from evermap.slam.changes.joint import may_search
+    from evermap.slam.space.moving import has_traffic
+    from evermap.types import is_in_space
+
+    needs: dict[str, Any] = {"unknown_ids": config.slam.unknown_ids}
+    if is_in_space(recording):
+        needs |= {"in_space": True, "traffic": has_traffic(recording)}
+    else:
+        needs |= {"search": may_search(len(recording.frames.stamp_s), in_map=in_map)}
+    warm_up(lambda: compile_kernels(**needs))
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +37,10 @@ SAME_STAMP_S = 1e-6
 
 ODOMETRY_GAP_S = 10.0
 """Longer pauses of the odometry are reported, and frames farther than this from any odometry are dropped."""
-
+FEWEST_STAMPS = 10
+"""Stamps of frames, and of the odometry, from which their unit is asked."""
+STAMP_UNITS = {1: "milliseconds", 2: "microseconds", 3: "nanoseconds"}
+"""By the power of 1,000."""
 
 OUTSIDE = 0.1
 """Share of an image by which the corner of a tag may lie outside: lenses and detectors extrapolate."""
@@ -198,7 +202,13 @@ def _outside_image(
 def _warn_of_gaps(odometry: Odometry | SpatialOdometry, warnings: list[str]) -> None:
     pause = np.diff(odometry.stamp_s)
     gaps = np.flatnonzero(pause > ODOMETRY_GAP_S)
-    if len(gaps):
+    if len(pause) >= FEWEST_STAMPS and 2 * len(gaps) > len(pause):
+        usual_s = float(np.median(pause))
+        warnings.append(
+            f"odometry has a row every {usual_s:.4g} s only: stamp_s may be in {STAMP_UNITS[1]} or {STAMP_UNITS[2]}, "
+            "seconds are expected"
+        )
+    elif len(gaps):
         start = odometry.stamp_s[0]
         shown = ", ".join(f"{pause[i]:.1f} s from {odometry.stamp_s[i] - start:.1f} s" for i in gaps[:3])
         more = ", ..." if len(gaps) > 3 else ""
@@ -207,9 +217,35 @@ def _warn_of_gaps(odometry: Odometry | SpatialOdometry, warnings: list[str]) -> 
         )
 
 
+def _refuse_other_units(odometry: Odometry | SpatialOdometry, frames: Frames, source: str) -> None:
+    """Refuse stamps by which frames, or the odometry, last about a thousand times as long as the other, or a million.
+
+    Both are of one drive, so lengths and steps differ alike by the unit. Those of a camera that was on for a moment, or
+    is slow, differ in one of the two only.
+    """
+    spans_s, steps_s = (
+        [float(measure(each.stamp_s)) for each in (frames, odometry)]
+        for measure in (np.ptp, lambda stamp_s: np.median(np.diff(stamp_s)) if len(stamp_s) > 1 else 0.0)
+    )
+    if min(len(frames), len(odometry)) < FEWEST_STAMPS or not min(*spans_s, *steps_s) > 0.0:
+        return
+    longer, slower = (math.log(seen / driven, 1e3) for seen, driven in (spans_s, steps_s))
+    power = round(longer)
+    if power == 0 or abs(longer - power) > 0.25 or abs(slower - power) > 0.5:
+        return
+    tables = ("frames and detections", "odometry")
+    wrong, other = tables if power > 0 else tables[::-1]
+    unit = STAMP_UNITS.get(abs(power), "another unit")
+    problem = (
+        f"stamps of the {wrong} seem to be in {unit}: they last {max(spans_s):.4g} s, the {other} {min(spans_s):.4g} s"
+    )
+    raise DataError(problem, path=source, field="stamp_s", hint="stamp both in seconds, with the same clock")
+
+
 def _without_far_frames(
     odometry: Odometry | SpatialOdometry, frames: Frames, detections: _Seen, source: str, warnings: list[str]
 ) -> tuple[Frames, _Seen]:
+    _refuse_other_units(odometry, frames, source)
     first, last = odometry.stamp_s[0], odometry.stamp_s[-1]
     keep = (frames.stamp_s >= first - ODOMETRY_GAP_S) & (frames.stamp_s <= last + ODOMETRY_GAP_S)
     if keep.all():

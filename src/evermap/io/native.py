@@ -147,7 +147,10 @@ def _needed(name: str, tables: Mapping[str, Table | None], files: FileSet) -> Ta
     """Return a table that a recording cannot do without."""
     table = tables[name]
     if table is None:
-        raise InputError("file is missing", path=files.path_of(f"{name}.csv"), hint=f"{name}.csv or .parquet")
+        hint = f"{name}.csv or .parquet"
+        if name == "detections" and tables["ranges"] is not None:
+            hint = "ranges are detections where nothing else is seen: its rows there, and kind = 'uwb' in sensor.toml"
+        raise InputError("file is missing", path=files.path_of(f"{name}.csv"), hint=hint)
     return table
 
 

@@ -125,6 +125,11 @@ class Check(Shown):
         """Whether the recording is usable."""
         return all(finding.usable for finding in self.findings)
 
+    @property
+    def is_refused(self) -> bool:
+        """Whether nothing can be estimated from the recording."""
+        return any(finding.is_refused for finding in self.findings)
+
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values with stable keys, for JSON."""
         return {
@@ -175,7 +180,7 @@ def odd(recording: AnyRecording, settings: SlamConfig) -> tuple[Finding, ...]:
     """
     found = find_misreadings(recording, settings)
     for finding in found:
-        if finding.code == "own-identities" and not finding.usable:
+        if finding.is_refused:
             raise DataError(f"{recording.name}: {finding.message}", hint="leave landmark_id empty, and `unknown_ids`")
     return tuple(found)
 
@@ -374,7 +379,7 @@ def _left_out_in_plane(recording: Recording, settings: SlamConfig) -> list[Findi
         some, told = with_bearings(some, settings) if some is recording else (some, ())
         remarks = (*told[1:], *prepare(some, settings=settings.odometry).warnings)  # the first counts ranges alone
     except DataError as error:
-        return [Finding("too-little", error.one_line().removeprefix(f"{recording.name}: "), usable=False)]
+        return [_refusal("too-little", error.one_line().removeprefix(f"{recording.name}: "))]
     return [Finding("left-out", remark) for remark in remarks]
 
 
@@ -393,7 +398,7 @@ def _left_out_in_space(recording: SpatialRecording, settings: SlamConfig) -> lis
     try:
         remarks = prepare_space(some, settings.space, fewest=0 if some is not recording else 2).warnings
     except DataError as error:
-        return [Finding("too-little", error.one_line().removeprefix(f"{recording.name}: "), usable=False)]
+        return [_refusal("too-little", error.one_line().removeprefix(f"{recording.name}: "))]
     return [Finding("left-out", remark) for remark in remarks]
 
 
@@ -463,7 +468,12 @@ def _identities(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
         f"{count} landmarks in {int(known.sum())} detections, {again} of them seen more than once: landmark_id must "
         f"identify the landmark, the same each time, not the detection"
     )
-    return [Finding("own-identities", message, usable=count < settings.own_ids)]
+    return [Finding("own-identities", message) if count < settings.own_ids else _refusal("own-identities", message)]
+
+
+def _refusal(code: str, message: str) -> Finding:
+    """Return a finding of a recording from which nothing can be estimated."""
+    return Finding(code, message, usable=False, is_refused=True)
 
 
 def valid(recording: AnyRecordingT, sensor: SensorConfig, prior_map: Landmarks | None = None) -> AnyRecordingT:
@@ -560,5 +570,5 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
     found = findings(recording, settings)
     anonymous = (recording.detections.landmark_id == UNKNOWN).all()
     if anonymous and not (settings.unknown_ids or has_traffic(recording)):
-        found = (*found, Finding("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"))
+        found = (_refusal("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"), *found)
     return Check(recording.name, recording.source, contents(recording), found, recording.warnings)

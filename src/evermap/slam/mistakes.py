@@ -767,11 +767,13 @@ class Finding:
         code: short and stable, for programs.
         message: the problem, its size, and the likely cause.
         usable: False if estimates would be meaningless.
+        is_refused: whether nothing can be estimated: `run_slam` raises `DataError`. It is not usable, then.
     """
 
     code: str
     message: str
     usable: bool = True
+    is_refused: bool = False
 
 
 def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]:

@@ -174,7 +174,7 @@ def test_what_cannot_be_used_is_told() -> None:
 def test_a_recording_without_identities_is_usable_by_geometry() -> None:
     nameless = seen(landmark_id=lambda ids: np.full_like(ids, -1))(room())
     [finding] = check_recording(nameless).findings
-    assert (finding.code, finding.usable) == ("no-identities", True)
+    assert (finding.code, finding.is_refused) == ("no-identities", True)  # `slam` asks for --unknown-ids
     assert "`unknown_ids`" in finding.message
     assert check_recording(nameless, Config(slam={"unknown_ids": True})).findings == ()
 
@@ -208,7 +208,7 @@ def test_the_command_tells_the_same(tmp_path: Path) -> None:
     fine = run(room())
     assert fine.exit_code == 0, fine.output
     assert "of them" in fine.stdout
-    carried = run(tagged_corridor(1, odometry=False).recording, "--json")
+    carried = run(tagged_corridor(1, odometry=False).recording, "--json", "--quick")
     assert carried.exit_code == 0
     assert json.loads(carried.stdout)["odometry"] == {}
     late = run(MISTAKES["odometry 3 s late"][0](room()))
