@@ -11,6 +11,7 @@ from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
 from evermap.config import LifetimeConfig
+from evermap.existence.sites import CliqueChains
 from evermap.maps.learning import ClassEvidence, ClassLives, History, stay_ages, with_priors
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap, Stays
@@ -80,6 +81,23 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
     assert wanders.p_hop > 0.9
     assert wanders.p_known < 0.1
     assert np.exp(is_taken.absence.log_conditional_survival(DAY_S, 14 * DAY_S)) > 0.9
+
+
+def test_hops_to_known_sites_are_forecast_as_often_as_they_were_seen() -> None:
+    """Of 40 things that hopped from a first site to a second one half hop back, half to a third one."""
+    count, day_s = 40, DAY_S * (1.0 + np.arange(3.0))
+    third = np.where(np.arange(count) % 2, 0, 2)
+    site = 3 * np.arange(count)[:, None] + np.stack([0 * third, 0 * third + 1, third], axis=1)
+    elsewhere, gone = np.array([-np.inf, *day_s[:2]]), np.array([*day_s[1:], np.inf])
+    columns = [np.tile(column, count) for column in (elsewhere, day_s, day_s, gone, np.array([1.0, 1.0, 0.0]))]
+    none = np.zeros(3 * count, dtype=np.int64)
+    stays = Stays(np.repeat(np.arange(count), 3), site.ravel(), none, np.zeros((3 * count, 2)), *columns)
+    life = ClassLives.of(stays, Lives(looks_s=day_s[:2]), day_s[2]).lives.of(0, np.zeros(2))
+    chains = CliqueChains.of(np.zeros(2, dtype=np.int64), 1)
+    share = np.full(2, 0.5 * life.p_known)  # as `believe.dynamics_of` has it
+    route, _ = chains.routes(np.ones(1), share, np.zeros(1, dtype=np.bool_))
+    assert route[chains.row_of_site[0], 2] == pytest.approx(0.5, abs=0.02)
+    assert route[chains.row_of_site[0], 0] == pytest.approx(0.5, abs=0.02)
 
 
 def test_what_is_missed_and_not_told_to_be_gone_has_gone_in_part() -> None:

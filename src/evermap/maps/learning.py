@@ -45,6 +45,8 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 USUAL = LifetimeConfig()
 BELIEVED = 2
 """Digits of the belief in an end that are learned from: less is no other evidence."""
+EM_STEPS = 30
+"""Of which each at least halves the error of a share."""
 AGES_AT_ONCE = 50
 """Of which the longest credible lifetimes are asked together."""
 
@@ -110,6 +112,25 @@ class History:
         average.
         """
         chances, events = (self.counts(self.recent & rows, self.stays.p_gone) for rows in (chance, event & chance))
+        return self._leaned(events, chances)
+
+    def share_known(self) -> FloatArray:
+        """Return (C + 1,) probability that who turns up again does so at a known site, as `believe.dynamics_of` takes
+        it: of known sites the one that was left has half. A hop is a draw that is repeated until it is another one, so
+        `p / (2 - p)` draws of its own site a hop do not show; they are counted by expectation (EM, Dempster 1977).
+        """
+        n_hops, chances, events = (
+            self.counts(self.recent & self.had_choice & rows, self.stays.p_gone)
+            for rows in (self.hopped, np.ones(len(self.hopped), dtype=np.bool_), self.to_known)
+        )
+        p = np.full(len(chances), 0.5)
+        for _ in range(EM_STEPS):
+            unseen = n_hops * p / (2.0 - p)
+            p = self._leaned(events + unseen, chances + unseen)
+        return p
+
+    def _leaned(self, events: FloatArray, chances: FloatArray) -> FloatArray:
+        """Return (C + 1,) shares of events in chances (C + 1,), which lean on their average."""
         # classes differ: every one counts for one event at most, however often it was seen
         weight = 1.0 / (chances[:-1] + self._strength)
         average = (0.5 + events[:-1] @ weight) / (1.0 + chances[:-1] @ weight)
@@ -238,7 +259,7 @@ class _Learned:
         statements = [Statement(life.stay, life.n_stays) if life else None for life in said]
         ages = stay_ages(history, self.seen)
         self.stay = tuple(learn_hazards(ages, statements, general_purpose()))
-        self.p_known = history.shares(history.to_known, history.had_choice)
+        self.p_known = history.share_known()
         self.n_stays = history.counts(history.recent).astype(np.int64)
         self.n_ended = history.counts(history.recent & np.isfinite(stays.gone_s)).astype(np.int64)
 

@@ -260,23 +260,23 @@ class _Truth:
         return {"moved_m": float(np.hypot(*moved)), "error_m": float(np.hypot(*error)), "squared": squared}
 
     def beliefs(self, living: LivingMap, session: int, pose: FloatArray) -> list[tuple[float, bool, bool]]:
-        """For every landmark that the map knows: P(exists), whether it stands at one of its known places, and whether
-        this session saw it. Left out is what has no place where its body stands most probably.
+        """For every landmark that the map knows: P(exists) at a session, whether it stands at one of its known places,
+        and whether this session saw it. Left out is what has no place where its body stands most probably.
+
+        The map of a session that is not found in it is that of the one before, so it is asked about now; and what was
+        moved by less than an outlier has left its place, though it stands near.
         """
-        places, members, found = living.places, living.members, []
+        places, members = living.places, living.members
         known = living.place_row(members.landmark_id, living.site_of()) >= 0
         stands = self.position_m[session, places.landmark_id]
         gap = np.hypot(*(se2.transform(pose, places.position_m) - stands).T)
-        right = np.unique(places.landmark_id[gap < OUTLIER_M])  # False for nan
-        last = dict(zip(living.sites.site_id.tolist(), living.sites.seen_s.tolist(), strict=True))
-        seen = {
-            name
-            for name, site in zip(places.landmark_id.tolist(), places.site_id.tolist(), strict=True)
-            if last[site] >= self.start_s[session]
-        }
-        for name, p in zip(members.landmark_id[known].tolist(), living.p_exists()[known].tolist(), strict=True):
-            found.append((p, bool(np.isin(name, right)), name in seen))
-        return found
+        seen_s = living.sites.seen_s[np.searchsorted(living.sites.site_id, places.site_id)]
+        when = np.clip(np.searchsorted(self.start_s, seen_s, side="right") - 1, 0, session)
+        stayed = _same(self.position_m[when, places.landmark_id], stands)
+        right = np.isin(members.landmark_id, places.landmark_id[stayed & (gap < OUTLIER_M)])  # False for nan
+        seen = np.isin(members.landmark_id, places.landmark_id[seen_s >= self.start_s[session]])
+        p = living.p_exists(max(living.stamp_s, float(self.start_s[session])))
+        return list(zip(p[known].tolist(), right[known].tolist(), seen[known].tolist(), strict=True))
 
     def alignment(self, living: LivingMap, session: int) -> FloatArray:
         """(3,) the map in the frame of the truth, by the landmarks that lie where they stand."""
