@@ -35,7 +35,6 @@ def test_a_place_that_is_split_off_is_turned_as_most_of_its_detections_say(seen_
         smoother=SimpleNamespace(problem=replace(problem, measured=measured)),
         estimate=replace(optimum.estimate, place=wrong),
         now=SimpleNamespace(weight=weight),
-        noise=optimum.noise,
     )
     found = split(asked, np.arange(len(true)), np.zeros(len(true), dtype=np.bool_))
     assert found is not None
@@ -46,27 +45,3 @@ def test_a_place_that_is_split_off_is_turned_as_most_of_its_detections_say(seen_
     off = se3.log(se3.between(true[tag], estimate.place[row]))
     assert np.linalg.norm(off[:3]) < 0.2
     assert np.linalg.norm(off[3:]) < 0.3
-
-
-def test_a_place_that_is_split_off_begins_where_its_detections_are_the_most_probable() -> None:
-    """All poses of the tag but one are decimetres off, as those of small tags; their corners are not."""
-    world = tagged_corridor(1, n_tags=8, n_frames=100)
-    optimum = solve_space(prepare_space(world.recording, Config().slam.space), None).optimum
-    problem, true, tag = optimum.smoother.problem, optimum.estimate.place, 3
-    mine = np.flatnonzero(problem.place == tag)
-    off = np.random.default_rng(0).normal(size=(len(mine), 3))
-    off *= 0.15 / np.linalg.norm(off, axis=1)[:, None]
-    off[len(mine) // 2] = 0.0
-    measured, wrong, weight = problem.measured.copy(), true.copy(), np.ones(len(problem.place))
-    measured[mine, :3] += off
-    wrong[tag, :3] += [4.0, 0.0, 0.0]
-    weight[mine] = 0.0
-    asked = SimpleNamespace(
-        smoother=SimpleNamespace(problem=replace(problem, measured=measured)),
-        estimate=replace(optimum.estimate, place=wrong),
-        now=SimpleNamespace(weight=weight),
-        noise=optimum.noise,
-    )
-    found = split(asked, np.arange(len(true)), np.zeros(len(true), dtype=np.bool_))
-    assert found is not None
-    assert np.linalg.norm(found[1].place[tag, :3] - true[tag, :3]) < 0.05

@@ -264,21 +264,6 @@ def _losses(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNo
     return np.asarray(0.5 * squared - np.logaddexp(0.0, 0.5 * squared - seen.log_odds[seen.kind]))
 
 
-def _find_likeliest(optimum: SpatialOptimum, at: FloatArray, near: IntArray, row: int) -> int:
-    """Return that of the detections `near` (K,) by whose place, of `at` (M, 7), all of them are the most probable.
-
-    A far one may be in the middle of all and centimetres off, too far for the close ones, which would stay outliers.
-    """
-    problem, estimate = optimum.smoother.problem, optimum.estimate
-    asked, losses = near[:: max(1, len(near) // MOST_CANDIDATES)], list[float]()
-    for one in asked.tolist():
-        place = estimate.place.copy()
-        place[row] = at[one]
-        trial = replace(estimate, place=place)
-        losses.append(float(losses_at(problem, trial, optimum.noise, near, row).sum()))
-    return int(asked[int(np.argmin(losses))])
-
-
 def rejoined(
     optimum: SpatialOptimum, identity: IntArray, apart: BoolArray
 ) -> tuple[SpatialProblem, SpatialEstimate] | None:
@@ -344,13 +329,12 @@ def split(
                 break
             votes[near] = 1.0
             begun.append(int(known) if unseen[known] else len(estimate.place) + len(places))
-            there = at[_find_likeliest(optimum, at, near, int(known))]
             if unseen[known]:
-                at_places[known], unseen[known] = there, False
+                at_places[known], unseen[known] = at[mine[centre]], False
                 prior = replace(prior, weight=np.where(prior.place == known, LEAST_WEIGHT, prior.weight))
             else:
                 place[near] = len(estimate.place) + len(places)
-                places.append(there)
+                places.append(at[mine[centre]])
                 copied.append(int(known))
             mine = mine[gap[centre] >= settings.together_m]
     if not places and prior is problem.prior:
