@@ -20,7 +20,10 @@ def make_problem(kind: str) -> BaseProblem:
     if kind == "space":
         return prepare_space(tagged_corridor(0).recording, SpaceConfig()).problem
     problem = make_world(0).problem
-    return replace(problem, share=np.linspace(0.1, 1.0, len(problem.pose_row)))
+    count = len(problem.pose_row)
+    return replace(
+        problem, share=np.linspace(0.1, 1.0, count), noise_shape=np.linspace(1.0, 3.0, 2 * count).reshape(count, 2)
+    )
 
 
 @pytest.fixture(params=["plane", "space"])

@@ -104,6 +104,16 @@ def sigmas_of(optimum) -> tuple[FloatArray, FloatArray]:
     )
 
 
+@pytest.mark.parametrize("outliers", [0.0, 0.02])
+def test_exact_positions_are_solved(outliers: float) -> None:
+    """As a simulator makes them: noise has a bound below, and does not vanish round by round."""
+    recording = field(1, lambda r: (0.0 * r, 0.0 * r), n_frames=60, outliers=outliers)
+    result = run_slam(recording)
+    assert compare_with_truth(recording, result).poses.rmse_m < 3e-3
+    assert result.verdict is not None
+    assert result.verdict.kind.is_trustworthy
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_noise_is_that_of_the_range(law: str) -> None:
     """One level has a lidar's noise wrong by a factor of five between the nearest and the farthest points."""

@@ -65,6 +65,7 @@ def learn_range_noise(optimum: SpatialOptimum) -> FloatArray:
     squares = now.weight[:, None] * now.residual**2 + explained
     expected = np.column_stack([squares[:, :2].sum(axis=1), squares[:, 2]]) * before**2
     measured_m = np.linalg.norm(problem.measured[:, :3], axis=1)
+    least = np.array(problem.settings.least_noise)[[ACROSS, ALONG]]
     numbers, range_m, found = now.weight[:, None] * NUMBERS, _expect_ranges(optimum), before.copy()
     for sensor in range(len(problem.mount)):
         own = np.flatnonzero((problem.sensor == sensor) & np.isfinite(problem.usual_m[:, 0]))
@@ -80,6 +81,8 @@ def learn_range_noise(optimum: SpatialOptimum) -> FloatArray:
                 expected[own, k] + imagined * usual,
                 count + imagined,
             )
+            # of exact positions, as a simulator makes them, nothing would be left
+            variance = np.maximum(variance, (least[k] * problem.usual_m[own, k]) ** 2)
             fitted[:, k] = np.sqrt(variance)
             gain += gain_by_variances(expected[own, k], count, before[own, k] ** 2, variance, problem.share[own])
         if gain > GAIN_NATS:
