@@ -298,7 +298,7 @@ def unpack_columns_of(
 ) -> dict[bytes, dict[str, NDArray[Any]]]:
     """Return some columns of each of several maps, by their names, with two fetches. Errors as `unpack`."""
     columns, manifests = [*columns], fetch(names)
-    listed = {name: _manifest(name, lambda _: manifests)["columns"] for name in names}
+    listed = {name: _manifest(name, lambda _: manifests, columns)["columns"] for name in names}
     if any(column not in some for some in listed.values() for column in columns):
         raise DamagedError("a column is missing")
     # revisions share columns, of which each is unpacked once
@@ -574,15 +574,16 @@ def _unfolded(lower: FloatArray, size: int) -> FloatArray:
     return matrix
 
 
-def _manifest(name: bytes, fetch: Fetch) -> Any:
-    """The values and the columns of a map, of the types that they have to have."""
+def _manifest(name: bytes, fetch: Fetch, wanted: Collection[str] | None = None) -> Any:
+    """The values and the columns of a map, of the types that they have to have; None checks all columns."""
     content = json_object(text_of(name, fetch))
     if content.get("format") not in (1, FORMAT, IN_SPACE):
         raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads 1 to {IN_SPACE}")
     columns = content.get("columns")
     if not isinstance(content.get("values"), dict) or not isinstance(columns, dict):
         raise DamagedError("a list of columns is missing")
-    for column, listed in columns.items():
+    for column in columns if wanted is None else columns.keys() & wanted:
+        listed = columns[column]
         if not (isinstance(listed, list) and len(listed) == 4 and _is_column(*listed)):
             raise DamagedError(f"column '{column}' is not described as columns are")
     return content

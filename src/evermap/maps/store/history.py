@@ -34,6 +34,7 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
 }  # fmt: skip
 """Values of a record, and their types in JSON; null for nan."""
 _SHOWN = 5
+_OF_PROVENANCE, _OF_REVISION = ([item.name for item in fields(kind)] for kind in (Provenance, Revision))
 _MAY_BE_NAN = ("stamp_from_s", "stamp_to_s", "wall_s")
 
 
@@ -138,8 +139,8 @@ class Record:
         """Return it as a `Revision` of the history."""
         row = {**self.about, "kind": RevisionKind(self.about["kind"]), "config": config}
         row |= {name: or_nan(row[name]) for name in _MAY_BE_NAN}
-        provenance = Provenance(**{item.name: row[item.name] for item in fields(Provenance)})
-        told = {item.name: row[item.name] for item in fields(Revision) if item.name in row}
+        provenance = Provenance(**{name: row[name] for name in _OF_PROVENANCE})
+        told = {name: row[name] for name in _OF_REVISION if name in row}
         counts = dict(Counter(change.kind for change in self.changes))
         return Revision(provenance=provenance, n_changes=counts, **told)
 

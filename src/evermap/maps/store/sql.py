@@ -314,7 +314,7 @@ class SqlStore(Shown, MapStore):
     ) -> dict[int, Evidence]:
         with self._transaction() as connection:
             records = self._records_of(connection, revisions)
-            parts = {record.number: [Evidence.empty()] for record in records}
+            parts: dict[int, list[Evidence]] = {record.number: [] for record in records}
             cliques = dict.fromkeys(parts, clique_id)
             if landmark_id is not None:
                 cliques = self._cliques_of(connection, records, landmark_id)
@@ -333,9 +333,7 @@ class SqlStore(Shown, MapStore):
             stored = self._fetched(connection, {row.name for _, row in rows})
             for number, row in rows:
                 parts[number].append(looks_of(row.clique_id, stored[row.name], row.name))
-        every = {number: some[0].joined(*some[1:]) for number, some in parts.items()}
-        every = {number: found[found.stamp_s >= since_s] for number, found in every.items()}
-        return {number: found[np.argsort(found.stamp_s, kind="stable")] for number, found in every.items()}
+        return {number: _by_time(some, since_s) for number, some in parts.items()}
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
         with self._transaction() as connection:
@@ -705,6 +703,15 @@ def announce(connection: Connection, what: str) -> None:
     """
     if connection.dialect.name == "postgresql":
         connection.execute(select(func.pg_notify(CHANNEL, what)))
+
+
+def _by_time(parts: Sequence[Evidence], since_s: float) -> Evidence:
+    """Join evidence, by time, without what is older. Of a long history most parts are one clique's, in order."""
+    every = parts[0].joined(*parts[1:]) if parts else Evidence.empty()
+    if len(every) and (every.stamp_s[0] < since_s or np.any(np.diff(every.stamp_s) < 0.0)):
+        every = every[every.stamp_s >= since_s]
+        every = every[np.argsort(every.stamp_s, kind="stable")]
+    return every
 
 
 def now_utc() -> str:
