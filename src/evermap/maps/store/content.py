@@ -40,6 +40,10 @@ IN_SPACE = 3
 _CHUNK = 4096
 """Values a chunk, as a rule: some 30 kB, so that one changed row costs little, and a large map has some hundred."""
 _SHORTEST, _LONGEST = _CHUNK // 4, 4 * _CHUNK
+_HISTORY = "stays."
+"""Table that grows with every session at its end, and loses its oldest rows once it is full."""
+_SHORTER = 16
+"""How much shorter its pieces are, 256 values: the name of each is 32 bytes in the manifest of every session."""
 _HASH = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio (Knuth 1973, 6.4)."""
 _PARTS = ("covariance_m2.parts", "sight.lines.parts", "sight.views.parts")
@@ -163,7 +167,7 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         flat = _flat(column, array)
         dtype = _KINDS[flat.dtype.kind]
         flat = flat.astype(dtype)
-        cut = [Chunk(dtype, flat[a:b].tobytes()) for a, b in itertools.pairwise(_cuts(flat))]
+        cut = [Chunk(dtype, flat[a:b].tobytes()) for a, b in itertools.pairwise(_cuts(flat, column))]
         names = [chunk.name for chunk in cut]
         chunks.update(zip(names, cut, strict=True))
         lower = len(flat) != array.size
@@ -215,18 +219,21 @@ def _read_part(name: bytes, stored: bytes) -> FloatArray:
         raise InputError(problem, hint="evermap map verify FILE, which lists the intact revisions") from None
 
 
-def _cuts(flat: NDArray[Any]) -> list[int]:
+def _cuts(flat: NDArray[Any], column: str = "") -> list[int]:
     """Return the cuts of a column: before values chosen by a hash, so that inserted rows do not shift later cuts."""
-    if len(flat) <= _LONGEST:
-        return [*range(0, len(flat), _CHUNK), len(flat)] if len(flat) else []
+    shorter = _SHORTER if column.startswith(_HISTORY) else 1
+    usual, shortest, longest = (size // shorter for size in (_CHUNK, _SHORTEST, _LONGEST))
+    if len(flat) <= (longest if shorter == 1 else usual):
+        return [*range(0, len(flat), usual), len(flat)] if len(flat) else []
     wide = np.ascontiguousarray(flat).view(np.uint64 if flat.itemsize == 8 else np.uint8).astype(np.uint64)
     with np.errstate(over="ignore"):
-        marked = np.flatnonzero((wide * _HASH) >> np.uint64(52) == 1)  # one in 4,096, but no zero
+        share = np.uint64(64 - (usual.bit_length() - 1))
+        marked = np.flatnonzero((wide * _HASH) >> share == 1)  # one in 4,096, or as many as `usual`, but no zero
     cuts = [0]
     for at in [*marked.tolist(), len(flat)]:
-        while at - cuts[-1] > _LONGEST:
-            cuts.append(cuts[-1] + _CHUNK)
-        if at - cuts[-1] >= _SHORTEST or at == len(flat):
+        while at - cuts[-1] > longest:
+            cuts.append(cuts[-1] + usual)
+        if at - cuts[-1] >= shortest or at == len(flat):
             cuts.append(at)
     return cuts
 
