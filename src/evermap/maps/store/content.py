@@ -51,6 +51,8 @@ _PARTS = ("covariance_m2.parts", "sight.lines.parts", "sight.views.parts")
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
+PLAIN = b"\x00"
+"""First of the stored bytes of a chunk that are not deflated, as those of a pack (`packs`)."""
 NAME_BYTES = 32
 MEMBERS = "members."
 """The table that is kept of a pruned revision: landmarks of its evidence, and operators' edits."""
@@ -92,19 +94,42 @@ class Chunk:
         them.
         """
         planes = np.frombuffer(self.raw, np.uint8).reshape(-1, np.dtype(self.dtype).itemsize).T
-        return zlib.compress(planes.tobytes(), level=1)  # covariances are most of a map, and more levels gain 3 %
+        return deflate(PLAIN + planes.tobytes())
 
     @classmethod
     def of_stored(cls, name: bytes, dtype: str, stored: bytes) -> Chunk:
         """Return what `stored` wrote under a name; `DamagedError` if it is anything else."""
         try:
-            planes = np.frombuffer(zlib.decompress(stored), np.uint8).reshape(np.dtype(dtype).itemsize, -1)
-        except (zlib.error, ValueError) as error:
+            planes = np.frombuffer(inflate(stored), np.uint8).reshape(np.dtype(dtype).itemsize, -1)
+        except ValueError as error:
             raise DamagedError(f"a part cannot be unpacked: {error}") from None
         chunk = cls(dtype, planes.T.tobytes())
         if chunk.name != name:
             raise DamagedError("a checksum does not match")
         return chunk
+
+
+def deflate(stored: bytes) -> bytes:
+    """Return stored bytes deflated, as every chunk is that is in no pack."""
+    # covariances are most of a map, and more levels gain 3 %
+    return zlib.compress(memoryview(stored)[1:], level=1) if stored[:1] == PLAIN else stored
+
+
+def inflate(stored: bytes) -> bytes:
+    """Return the values of stored bytes, as `Chunk.stored` arranges them; `DamagedError` if they are anything else."""
+    try:
+        return stored[1:] if stored[:1] == PLAIN else zlib.decompress(stored)
+    except zlib.error as error:
+        raise DamagedError(f"a part cannot be unpacked: {error}") from None
+
+
+def is_chunk(name: bytes, stored: bytes) -> bool:
+    """Return whether stored bytes match their name, of any type."""
+    for dtype in DTYPES:
+        with suppress(DamagedError):
+            Chunk.of_stored(name, dtype, stored)
+            return True
+    return False
 
 
 def text_chunk(text: str) -> Chunk:
@@ -315,13 +340,20 @@ def unpack_columns_of(
     return {name: {column: arrays[column, str(some[column])] for column in columns} for name, some in listed.items()}
 
 
+def parts_of(name: bytes, fetch: Fetch, table: str = "") -> dict[str, list[bytes]]:
+    """Return the names of the chunks of a map by column, or of one of its tables, '' for its manifest. Errors as
+    `unpack`.
+    """
+    columns = _manifest(name, fetch)["columns"].items()
+    listed = {column: names for column, (_, _, _, names) in columns if column.startswith(table)}
+    return {"": [name], **{column: [name_of(part) for part in names] for column, names in listed.items()}}
+
+
 def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
     """Return the names of all chunks of a map, or of one of its tables, its manifest's among them. Errors as
     `unpack`.
     """
-    columns = _manifest(name, fetch)["columns"].items()
-    listed = (names for column, (_, _, _, names) in columns if column.startswith(table))
-    return {name, *(name_of(part) for names in listed for part in names)}
+    return {part for names in parts_of(name, fetch, table).values() for part in names}
 
 
 _TABLES = (

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, replace
 from itertools import chain, islice
 from typing import Any
 
-from evermap.maps.store.content import Chunk, DamagedError, Fetch, json_object, name_of, names_in, text_chunk, text_of
+from evermap.maps.store.content import Chunk, DamagedError, Fetch, json_object, name_of, parts_of, text_chunk, text_of
 from evermap.maps.store.measured import CliqueLooks, read_index
 from evermap.maps.store.protocol import Attachment, Provenance, Revision, RevisionKind
 from evermap.types import ChangeKind, MapChange, or_nan
@@ -124,9 +124,20 @@ class Record:
 
     def chunks(self, fetch: Fetch, table: str = "") -> set[bytes]:
         """Return the names of all its chunks but its own; of its content, those of one table if that is named."""
-        found = names_in(self.content, fetch, table) | {self.config, *(name for name, _ in self.attachments.values())}
+        return {name for names in self.parts(fetch, table).values() for name in names}
+
+    def parts(self, fetch: Fetch, table: str = "") -> dict[tuple[str, str | int], list[bytes]]:
+        """Return the same by what they hold, which is alike in successive revisions."""
+        found: dict[tuple[str, str | int], list[bytes]] = {
+            ("content", column): names for column, names in parts_of(self.content, fetch, table).items()
+        }
+        found[("config", "")] = [self.config]
+        for attachment, (name, _) in self.attachments.items():
+            found[("attachment", attachment)] = [name]
         if self.evidence is not None:
-            found |= {self.evidence, *(row.name for row in self.looks(fetch))}
+            found[("evidence", "")] = [self.evidence]
+            for row in self.looks(fetch):
+                found.setdefault(("looks", row.clique_id), []).append(row.name)
         return found
 
     def attached(self) -> list[Attachment]:
