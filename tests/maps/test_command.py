@@ -293,6 +293,19 @@ def test_gc_prunes_old_revisions(site: Path, tmp_path: Path) -> None:
     assert run("gc", site, "--keep", 0).exit_code == 2
 
 
+def test_compact_tells_what_it_saved(site: Path) -> None:
+    landmark, size = int(MAPS[2].members.landmark_id[0]), site.stat().st_size
+    asked = [("log", site), ("why", site, landmark), ("show", site, "--revision", 1), ("diff", site, 1, 3)]
+    before = [run(*one).stdout for one in asked]
+    done = said("compact", site)
+    assert done == {"map": str(site), "bytes_before": size, "bytes": site.stat().st_size}
+    assert [run(*one).stdout for one in asked] == before
+    assert run("compact", site).stderr.startswith(f"evermap: {site}: ")
+    refused = run("compact", "postgresql://nowhere/fleet/site")
+    assert refused.exit_code == 2
+    assert "VACUUM FULL" in refused.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

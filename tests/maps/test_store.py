@@ -319,6 +319,25 @@ def test_the_cost_of_a_revision_does_not_grow_with_the_history(tmp_path: Path) -
     assert grown[60:].sum() < 1.5 * grown[:30].sum()
 
 
+def test_a_history_of_stays_is_written_again_at_its_ends_only() -> None:
+    """Sessions that add five stays each, the newest 1,000 of which are kept."""
+    living, random = random_map(2, cliques=8), np.random.default_rng(0)
+    rows = np.arange(5) % len(living.stays)
+    stays, known, cost, whole = living.stays[rows[:0]], set[bytes](), [], []
+    for number in range(260):
+        first_s = 1e4 * (number + random.random(5))
+        position_m = random.normal(size=(5, 2))
+        new = replace(living.stays[rows], first_s=first_s, last_s=first_s + 1e4, position_m=position_m)
+        stays = stays.joined(new)
+        stays = stays[np.arange(max(0, len(stays) - 1000), len(stays))]
+        _, chunks = content.pack(replace(living, stays=stays))
+        whole.append(sum(len(chunk.stored()) for chunk in chunks.values()))
+        cost.append(sum(len(chunk.stored()) for name, chunk in chunks.items() if name not in known))
+        known |= chunks.keys()
+    assert np.mean(cost[-50:]) < 0.6 * np.mean(whole[-50:])
+    assert np.mean(cost[150:200]) < 0.3 * np.mean(whole[150:200])  # before the oldest ones go
+
+
 def rewritten(living: LivingMap, change: Callable[[dict[str, Any]], None]) -> LivingMap:
     """A map as it is read when its manifest was another."""
     name, chunks = content.pack(living)

@@ -153,7 +153,7 @@ def test_a_newer_schema_is_left_alone(tmp_path: Path) -> None:
         open_store(path, create=True)
     line = caught.value.one_line()
     assert line.startswith(f"{path}: a map of schema version 99; this evermap, ")
-    assert f"knows up to {schema.SCHEMA_VERSION}" in line
+    assert f"knows up to {schema.PACKED_VERSION}" in line
     assert "a newer evermap)" in line
     assert path.read_bytes() == content
 

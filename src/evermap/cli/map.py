@@ -567,6 +567,32 @@ def gc(
         print_json(told[0] if store is None and len(told) == 1 else {"maps": told})
 
 
+@app.command("compact")
+def compact(file: MapFile, as_json: AsJson = False) -> None:
+    """Shrink the file of a map: compress all revisions but the newest together. Nothing is lost.
+
+    Every command answers as before, and later sessions give the same map; an evermap that is older than this command
+    cannot read the file any more. Sessions that come in afterwards are compressed by the next call. If the process is
+    killed, the map is as it was.
+
+    \b
+    Example:
+      evermap map compact site.evermap
+    """
+    from evermap.maps.store import is_address, open_store
+
+    if is_address(file):
+        raise ConfigError("is no file", field="MAP", hint="VACUUM FULL of the database's own tools")
+    with open_store(file) as opened:
+        before = Path(opened.where).stat().st_size
+        opened.compact()
+        after = Path(opened.where).stat().st_size
+    if as_json:
+        print_json({"map": file, "bytes_before": before, "bytes": after})
+    else:
+        say(f"{file}: {before / 1e3:,.0f} kB before, {after / 1e3:,.0f} kB now ({after / before:.0%})")
+
+
 @app.command("reenter")
 def reenter(
     maps: Maps = None,

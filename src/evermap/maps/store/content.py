@@ -40,6 +40,10 @@ IN_SPACE = 3
 _CHUNK = 4096
 """Values a chunk, as a rule: some 30 kB, so that one changed row costs little, and a large map has some hundred."""
 _SHORTEST, _LONGEST = _CHUNK // 4, 4 * _CHUNK
+_HISTORY = "stays."
+"""Table that grows with every session at its end, and loses its oldest rows once it is full."""
+_SHORTER = 16
+"""How much shorter its pieces are, 256 values: the name of each is 32 bytes in the manifest of every session."""
 _HASH = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio (Knuth 1973, 6.4)."""
 _PARTS = ("covariance_m2.parts", "sight.lines.parts", "sight.views.parts")
@@ -47,6 +51,8 @@ _PARTS = ("covariance_m2.parts", "sight.lines.parts", "sight.views.parts")
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
+PLAIN = b"\x00"
+"""First of the stored bytes of a chunk that are not deflated, as those of a pack (`packs`)."""
 NAME_BYTES = 32
 MEMBERS = "members."
 """The table that is kept of a pruned revision: landmarks of its evidence, and operators' edits."""
@@ -88,19 +94,42 @@ class Chunk:
         them.
         """
         planes = np.frombuffer(self.raw, np.uint8).reshape(-1, np.dtype(self.dtype).itemsize).T
-        return zlib.compress(planes.tobytes(), level=1)  # covariances are most of a map, and more levels gain 3 %
+        return deflate(PLAIN + planes.tobytes())
 
     @classmethod
     def of_stored(cls, name: bytes, dtype: str, stored: bytes) -> Chunk:
         """Return what `stored` wrote under a name; `DamagedError` if it is anything else."""
         try:
-            planes = np.frombuffer(zlib.decompress(stored), np.uint8).reshape(np.dtype(dtype).itemsize, -1)
-        except (zlib.error, ValueError) as error:
+            planes = np.frombuffer(inflate(stored), np.uint8).reshape(np.dtype(dtype).itemsize, -1)
+        except ValueError as error:
             raise DamagedError(f"a part cannot be unpacked: {error}") from None
         chunk = cls(dtype, planes.T.tobytes())
         if chunk.name != name:
             raise DamagedError("a checksum does not match")
         return chunk
+
+
+def deflate(stored: bytes) -> bytes:
+    """Return stored bytes deflated, as every chunk is that is in no pack."""
+    # covariances are most of a map, and more levels gain 3 %
+    return zlib.compress(memoryview(stored)[1:], level=1) if stored[:1] == PLAIN else stored
+
+
+def inflate(stored: bytes) -> bytes:
+    """Return the values of stored bytes, as `Chunk.stored` arranges them; `DamagedError` if they are anything else."""
+    try:
+        return stored[1:] if stored[:1] == PLAIN else zlib.decompress(stored)
+    except zlib.error as error:
+        raise DamagedError(f"a part cannot be unpacked: {error}") from None
+
+
+def is_chunk(name: bytes, stored: bytes) -> bool:
+    """Return whether stored bytes match their name, of any type."""
+    for dtype in DTYPES:
+        with suppress(DamagedError):
+            Chunk.of_stored(name, dtype, stored)
+            return True
+    return False
 
 
 def text_chunk(text: str) -> Chunk:
@@ -163,7 +192,7 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         flat = _flat(column, array)
         dtype = _KINDS[flat.dtype.kind]
         flat = flat.astype(dtype)
-        cut = [Chunk(dtype, flat[a:b].tobytes()) for a, b in itertools.pairwise(_cuts(flat))]
+        cut = [Chunk(dtype, flat[a:b].tobytes()) for a, b in itertools.pairwise(_cuts(flat, column))]
         names = [chunk.name for chunk in cut]
         chunks.update(zip(names, cut, strict=True))
         lower = len(flat) != array.size
@@ -215,18 +244,21 @@ def _read_part(name: bytes, stored: bytes) -> FloatArray:
         raise InputError(problem, hint="evermap map verify FILE, which lists the intact revisions") from None
 
 
-def _cuts(flat: NDArray[Any]) -> list[int]:
+def _cuts(flat: NDArray[Any], column: str = "") -> list[int]:
     """Return the cuts of a column: before values chosen by a hash, so that inserted rows do not shift later cuts."""
-    if len(flat) <= _LONGEST:
-        return [*range(0, len(flat), _CHUNK), len(flat)] if len(flat) else []
+    shorter = _SHORTER if column.startswith(_HISTORY) else 1
+    usual, shortest, longest = (size // shorter for size in (_CHUNK, _SHORTEST, _LONGEST))
+    if len(flat) <= (longest if shorter == 1 else usual):
+        return [*range(0, len(flat), usual), len(flat)] if len(flat) else []
     wide = np.ascontiguousarray(flat).view(np.uint64 if flat.itemsize == 8 else np.uint8).astype(np.uint64)
     with np.errstate(over="ignore"):
-        marked = np.flatnonzero((wide * _HASH) >> np.uint64(52) == 1)  # one in 4,096, but no zero
+        share = np.uint64(64 - (usual.bit_length() - 1))
+        marked = np.flatnonzero((wide * _HASH) >> share == 1)  # one in 4,096, or as many as `usual`, but no zero
     cuts = [0]
     for at in [*marked.tolist(), len(flat)]:
-        while at - cuts[-1] > _LONGEST:
-            cuts.append(cuts[-1] + _CHUNK)
-        if at - cuts[-1] >= _SHORTEST or at == len(flat):
+        while at - cuts[-1] > longest:
+            cuts.append(cuts[-1] + usual)
+        if at - cuts[-1] >= shortest or at == len(flat):
             cuts.append(at)
     return cuts
 
@@ -298,7 +330,7 @@ def unpack_columns_of(
 ) -> dict[bytes, dict[str, NDArray[Any]]]:
     """Return some columns of each of several maps, by their names, with two fetches. Errors as `unpack`."""
     columns, manifests = [*columns], fetch(names)
-    listed = {name: _manifest(name, lambda _: manifests)["columns"] for name in names}
+    listed = {name: _manifest(name, lambda _: manifests, columns)["columns"] for name in names}
     if any(column not in some for some in listed.values() for column in columns):
         raise DamagedError("a column is missing")
     # revisions share columns, of which each is unpacked once
@@ -308,13 +340,20 @@ def unpack_columns_of(
     return {name: {column: arrays[column, str(some[column])] for column in columns} for name, some in listed.items()}
 
 
+def parts_of(name: bytes, fetch: Fetch, table: str = "") -> dict[str, list[bytes]]:
+    """Return the names of the chunks of a map by column, or of one of its tables, '' for its manifest. Errors as
+    `unpack`.
+    """
+    columns = _manifest(name, fetch)["columns"].items()
+    listed = {column: names for column, (_, _, _, names) in columns if column.startswith(table)}
+    return {"": [name], **{column: [name_of(part) for part in names] for column, names in listed.items()}}
+
+
 def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
     """Return the names of all chunks of a map, or of one of its tables, its manifest's among them. Errors as
     `unpack`.
     """
-    columns = _manifest(name, fetch)["columns"].items()
-    listed = (names for column, (_, _, _, names) in columns if column.startswith(table))
-    return {name, *(name_of(part) for names in listed for part in names)}
+    return {part for names in parts_of(name, fetch, table).values() for part in names}
 
 
 _TABLES = (
@@ -574,15 +613,16 @@ def _unfolded(lower: FloatArray, size: int) -> FloatArray:
     return matrix
 
 
-def _manifest(name: bytes, fetch: Fetch) -> Any:
-    """The values and the columns of a map, of the types that they have to have."""
+def _manifest(name: bytes, fetch: Fetch, wanted: Collection[str] | None = None) -> Any:
+    """The values and the columns of a map, of the types that they have to have; None checks all columns."""
     content = json_object(text_of(name, fetch))
     if content.get("format") not in (1, FORMAT, IN_SPACE):
         raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads 1 to {IN_SPACE}")
     columns = content.get("columns")
     if not isinstance(content.get("values"), dict) or not isinstance(columns, dict):
         raise DamagedError("a list of columns is missing")
-    for column, listed in columns.items():
+    for column in columns if wanted is None else columns.keys() & wanted:
+        listed = columns[column]
         if not (isinstance(listed, list) and len(listed) == 4 and _is_column(*listed)):
             raise DamagedError(f"column '{column}' is not described as columns are")
     return content

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, replace
 from itertools import chain, islice
 from typing import Any
 
-from evermap.maps.store.content import Chunk, DamagedError, Fetch, json_object, name_of, names_in, text_chunk, text_of
+from evermap.maps.store.content import Chunk, DamagedError, Fetch, json_object, name_of, parts_of, text_chunk, text_of
 from evermap.maps.store.measured import CliqueLooks, read_index
 from evermap.maps.store.protocol import Attachment, Provenance, Revision, RevisionKind
 from evermap.types import ChangeKind, MapChange, or_nan
@@ -34,6 +34,7 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
 }  # fmt: skip
 """Values of a record, and their types in JSON; null for nan."""
 _SHOWN = 5
+_OF_PROVENANCE, _OF_REVISION = ([item.name for item in fields(kind)] for kind in (Provenance, Revision))
 _MAY_BE_NAN = ("stamp_from_s", "stamp_to_s", "wall_s")
 
 
@@ -123,9 +124,20 @@ class Record:
 
     def chunks(self, fetch: Fetch, table: str = "") -> set[bytes]:
         """Return the names of all its chunks but its own; of its content, those of one table if that is named."""
-        found = names_in(self.content, fetch, table) | {self.config, *(name for name, _ in self.attachments.values())}
+        return {name for names in self.parts(fetch, table).values() for name in names}
+
+    def parts(self, fetch: Fetch, table: str = "") -> dict[tuple[str, str | int], list[bytes]]:
+        """Return the same by what they hold, which is alike in successive revisions."""
+        found: dict[tuple[str, str | int], list[bytes]] = {
+            ("content", column): names for column, names in parts_of(self.content, fetch, table).items()
+        }
+        found[("config", "")] = [self.config]
+        for attachment, (name, _) in self.attachments.items():
+            found[("attachment", attachment)] = [name]
         if self.evidence is not None:
-            found |= {self.evidence, *(row.name for row in self.looks(fetch))}
+            found[("evidence", "")] = [self.evidence]
+            for row in self.looks(fetch):
+                found.setdefault(("looks", row.clique_id), []).append(row.name)
         return found
 
     def attached(self) -> list[Attachment]:
@@ -138,8 +150,8 @@ class Record:
         """Return it as a `Revision` of the history."""
         row = {**self.about, "kind": RevisionKind(self.about["kind"]), "config": config}
         row |= {name: or_nan(row[name]) for name in _MAY_BE_NAN}
-        provenance = Provenance(**{item.name: row[item.name] for item in fields(Provenance)})
-        told = {item.name: row[item.name] for item in fields(Revision) if item.name in row}
+        provenance = Provenance(**{name: row[name] for name in _OF_PROVENANCE})
+        told = {name: row[name] for name in _OF_REVISION if name in row}
         counts = dict(Counter(change.kind for change in self.changes))
         return Revision(provenance=provenance, n_changes=counts, **told)
 

@@ -224,6 +224,13 @@ class MapStore(Protocol):
         """
         ...
 
+    def compact(self) -> None:
+        """Store the same in fewer bytes: all or nothing, and no damaged map. All answers are as before.
+
+        Chunks of all revisions but the newest are compressed together. An older evermap refuses the map then.
+        """
+        ...
+
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
         """Return the committed changes of one revision."""
         ...

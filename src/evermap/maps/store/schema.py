@@ -16,6 +16,8 @@ from sqlalchemy import Column, Connection, Integer, LargeBinary, MetaData, Table
 from evermap.maps.store.content import DamagedError
 
 SCHEMA_VERSION = 4
+PACKED_VERSION = 5
+"""Of a store with packs (`packs`), which an older evermap would take for damage; its tables are those of version 4."""
 
 metadata = MetaData()
 

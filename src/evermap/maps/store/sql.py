@@ -21,9 +21,10 @@ from evermap.existence.sites import Evidence
 from evermap.maps.diff import grown
 from evermap.maps.living import LivingMap, Members
 from evermap.maps.store import content, schema
-from evermap.maps.store.content import Chunk, DamagedError
-from evermap.maps.store.history import Record, about, lineage, pruned_to_text, ranges, read_pruned
+from evermap.maps.store.content import Chunk, DamagedError, deflate, inflate, is_chunk
+from evermap.maps.store.history import STORY, Record, about, lineage, pruned_to_text, ranges, read_pruned
 from evermap.maps.store.measured import evidence_to_chunks, looks_of, read_index
+from evermap.maps.store.packs import MEMBER_BYTES, PACK_BYTES, make_pack, open_members, place_of
 from evermap.maps.store.protocol import (
     Attachment,
     DamagedMapError,
@@ -49,6 +50,9 @@ _MOST_CHECKED = 2_000
 """Names of checked chunks that are remembered, a few times those of one map."""
 _AT_ONCE = 500
 """Names in one question to the database."""
+_PACKED_AT_ONCE = 64
+"""The same when packing: some 10 MB."""
+_LENGTH = func.length(schema.chunk.c.data)
 _LONGEST = 900_000_000
 """Bytes of an attachment; a database takes no more in one piece."""
 
@@ -266,18 +270,83 @@ class SqlStore(Shown, MapStore):
             for number in kept:  # as long as one of them is damaged, an old one may be needed
                 self._unpacked(connection, records[number])
             doomed = self._only_of(connection, records, old, kept)
-            n_bytes, size = 0, select(func.sum(func.length(schema.chunk.c.data)))
+            doomed |= {pack for pack, members in self._packs(connection).items() if members <= doomed}
+            n_bytes, size = 0, select(func.sum(_LENGTH))
             for some in _batches(doomed):
-                mine = schema.chunk.c.name.in_(some)
-                n_bytes += connection.execute(size.where(mine)).scalar() or 0
-                if not dry_run:
-                    connection.execute(delete(schema.chunk).where(mine))
+                n_bytes += connection.execute(size.where(schema.chunk.c.name.in_(some))).scalar() or 0
+            if not dry_run:
+                self._delete(connection, doomed)
             if old and not dry_run:
                 self._move_anchor(connection, *self._anchor(connection), {**pruned, **dict.fromkeys(old, now_utc())})
         if not dry_run:
             self._checked -= doomed
             self._tidy()  # also what an earlier call was killed before
         return Pruning(tuple(sorted(old)), tuple(sorted(kept)), len(doomed), n_bytes)
+
+    def compact(self) -> None:
+        with self._transaction(writes=True) as connection:
+            head, anchor = self._anchor(connection)
+            before = self._packs(connection)
+            for names in self._alike(connection):
+                some, n_bytes = dict[bytes, bytes](), 0
+                for batch in _batches(names, _PACKED_AT_ONCE):
+                    stored = self._fetched(connection, batch)
+                    for name in batch:
+                        if not is_chunk(name, stored[name]):
+                            raise DamagedError("a checksum does not match")
+                        some[name] = stored[name]
+                        n_bytes += len(inflate(stored[name]))
+                        if n_bytes >= PACK_BYTES:
+                            self._replace(connection, make_pack(some))
+                            some, n_bytes = {}, 0
+                self._replace(connection, make_pack(some))
+            after = self._packs(connection)
+            self._delete(connection, before.keys() - after.keys())
+            version = schema.PACKED_VERSION if after else schema.SCHEMA_VERSION
+            self._move_anchor(connection, head, anchor, version=version)
+        self._tidy()  # also what an earlier call was killed before
+
+    def _alike(self, connection: Connection) -> Iterator[list[bytes]]:
+        """Yield the names of chunks of one kind of all revisions but the newest, oldest first; those of the newest,
+        which every session reads, are taken out of their packs. Attachments are compressed already but for stories.
+        """
+        fetch = partial(self._fetched, connection)
+        records, pruned = self._chain(connection)[0], self._pruned(connection)
+        if not records:
+            return
+        rows = connection.execute(select(schema.revision).order_by(schema.revision.c.number))
+        names = {row.number: row.record for row in rows if row.number in records}
+        newest = max(records)
+        apart = {names[newest], *records[newest].chunks(fetch)}
+        self._replace(connection, {name: deflate(data) for name, data in fetch(apart).items()})
+        found: dict[object, dict[bytes, None]] = {"record": dict.fromkeys(names.values())}
+        for number, record in sorted(records.items()):
+            for kind, parts in record.parts(fetch, content.MEMBERS if number in pruned else "").items():
+                if kind[0] != "attachment" or kind[1] == STORY:
+                    found.setdefault(kind, {}).update(dict.fromkeys(parts))
+        seen = apart
+        for alike in found.values():
+            yield [name for name in alike if name not in seen]
+            seen |= alike.keys()
+
+    def _packs(self, connection: Connection) -> dict[bytes, set[bytes]]:
+        """Names of the packs and of the members of each."""
+        found: dict[bytes, set[bytes]] = {}
+        for name, data in connection.execute(select(schema.chunk).where(_LENGTH == MEMBER_BYTES)):
+            place = place_of(data)
+            if place is not None:
+                found.setdefault(place.pack, set()).add(name)
+        return found
+
+    def _replace(self, connection: Connection, rows: Mapping[bytes, bytes]) -> None:
+        """Store bytes of chunks and packs in the place of those that are there."""
+        self._delete(connection, rows)
+        if rows:
+            connection.execute(insert(schema.chunk), [{"name": name, "data": data} for name, data in rows.items()])
+
+    def _delete(self, connection: Connection, names: Iterable[bytes]) -> None:
+        for some in _batches(names):
+            connection.execute(delete(schema.chunk).where(schema.chunk.c.name.in_(some)))
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
         with self._transaction() as connection:
@@ -314,7 +383,7 @@ class SqlStore(Shown, MapStore):
     ) -> dict[int, Evidence]:
         with self._transaction() as connection:
             records = self._records_of(connection, revisions)
-            parts = {record.number: [Evidence.empty()] for record in records}
+            parts: dict[int, list[Evidence]] = {record.number: [] for record in records}
             cliques = dict.fromkeys(parts, clique_id)
             if landmark_id is not None:
                 cliques = self._cliques_of(connection, records, landmark_id)
@@ -333,9 +402,7 @@ class SqlStore(Shown, MapStore):
             stored = self._fetched(connection, {row.name for _, row in rows})
             for number, row in rows:
                 parts[number].append(looks_of(row.clique_id, stored[row.name], row.name))
-        every = {number: some[0].joined(*some[1:]) for number, some in parts.items()}
-        every = {number: found[found.stamp_s >= since_s] for number, found in every.items()}
-        return {number: found[np.argsort(found.stamp_s, kind="stable")] for number, found in every.items()}
+        return {number: _by_time(some, since_s) for number, some in parts.items()}
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
         with self._transaction() as connection:
@@ -377,7 +444,7 @@ class SqlStore(Shown, MapStore):
             if made is not None:
                 values = {"created_at": made[0], "evermap_version": made[1]}
                 connection.execute(update(schema.store).values(values))
-            rows = [{"name": name, "data": data} for name, data in chunks.items()]
+            rows = [{"name": name, "data": deflate(data)} for name, data in chunks.items()]
             if rows:
                 connection.execute(insert(schema.chunk), rows)
             numbers = [{"number": number, "record": records.get(number)} for number in range(1, head + 1)]
@@ -404,7 +471,7 @@ class SqlStore(Shown, MapStore):
                     wanted |= record.chunks(fetch)
             for some in _batches(sorted(wanted)):
                 there = connection.execute(select(schema.chunk.c.name).where(schema.chunk.c.name.in_(some))).scalars()
-                rows = [{"name": name, "data": data} for name, data in fetch(set(some) - set(there)).items()]
+                rows = [{"name": name, "data": deflate(data)} for name, data in fetch(set(some) - set(there)).items()]
                 if rows:
                     connection.execute(insert(schema.chunk), rows)
             if new := [{"number": number, "record": name} for number, name in sorted(named.items()) if number > head]:
@@ -490,13 +557,20 @@ class SqlStore(Shown, MapStore):
         return values[3], values[4]
 
     def _move_anchor(
-        self, connection: Connection, head: int, record: bytes | None, pruned: Mapping[int, str] | None = None
+        self,
+        connection: Connection,
+        head: int,
+        record: bytes | None,
+        pruned: Mapping[int, str] | None = None,
+        version: int | None = None,
     ) -> None:
-        """Seal the row of `store` with other values; `pruned` is None to leave those as they are."""
+        """Seal the row of `store` with other values; `pruned` and `version` are None to leave those as they are."""
         row = connection.execute(select(schema.store)).one()
         listed = row.pruned if pruned is None else pruned_to_text(pruned)
-        sealed = schema.checksum(row.schema_version, row.created_at, row.evermap_version, head, record, listed)
-        connection.execute(update(schema.store).values(head=head, record=record, pruned=listed, checksum=sealed))
+        version = row.schema_version if version is None else version
+        sealed = schema.checksum(version, row.created_at, row.evermap_version, head, record, listed)
+        values = {"schema_version": version, "head": head, "record": record, "pruned": listed, "checksum": sealed}
+        connection.execute(update(schema.store).values(values))
         announce(connection, connection.get_execution_options().get("schema", ""))
 
     def _chain(self, connection: Connection, since: int = 1) -> tuple[dict[int, Record], dict[int, bytes | None]]:
@@ -600,6 +674,12 @@ class SqlStore(Shown, MapStore):
                 found[name] = data
         if not missing_ok and found.keys() != wanted:
             raise DamagedError("a part of the map is missing")
+        return open_members(found, partial(self._pack, connection), missing_ok=missing_ok)
+
+    def _pack(self, connection: Connection, name: bytes) -> bytes:
+        found = connection.execute(select(schema.chunk.c.data).where(schema.chunk.c.name == name)).scalar()
+        if not isinstance(found, bytes):
+            raise DamagedError("a pack of the map is missing")
         return found
 
     def _schema_version(self, connection: Connection) -> int:
@@ -616,9 +696,9 @@ class SqlStore(Shown, MapStore):
         version = connection.execute(select(schema.store.c.schema_version)).scalar()
         if not isinstance(version, int) or version < 1:
             raise DamagedError(f"its schema version is {version!r}")
-        if version > schema.SCHEMA_VERSION:
+        if version > schema.PACKED_VERSION:
             problem = (
-                f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.SCHEMA_VERSION}"
+                f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.PACKED_VERSION}"
             )
             raise InputError(problem, path=self.where, hint="open it with a newer evermap")
         columns = {column["name"] for column in inspect(connection).get_columns("store")}
@@ -707,12 +787,21 @@ def announce(connection: Connection, what: str) -> None:
         connection.execute(select(func.pg_notify(CHANNEL, what)))
 
 
+def _by_time(parts: Sequence[Evidence], since_s: float) -> Evidence:
+    """Join evidence, by time, without what is older. Of a long history most parts are one clique's, in order."""
+    every = parts[0].joined(*parts[1:]) if parts else Evidence.empty()
+    if len(every) and (every.stamp_s[0] < since_s or np.any(np.diff(every.stamp_s) < 0.0)):
+        every = every[every.stamp_s >= since_s]
+        every = every[np.argsort(every.stamp_s, kind="stable")]
+    return every
+
+
 def now_utc() -> str:
     """Return ISO 8601, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _batches(names: Iterable[bytes]) -> Iterator[list[bytes]]:
+def _batches(names: Iterable[bytes], size: int = _AT_ONCE) -> Iterator[list[bytes]]:
     wanted = list(names)
-    for at in range(0, len(wanted), _AT_ONCE):
-        yield wanted[at : at + _AT_ONCE]
+    for at in range(0, len(wanted), size):
+        yield wanted[at : at + size]

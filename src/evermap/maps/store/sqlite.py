@@ -22,9 +22,10 @@ from sqlalchemy import Connection, Engine, NullPool, create_engine, event
 from evermap.errors import InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import content
-from evermap.maps.store.content import DTYPES, NAME_BYTES, Chunk, DamagedError
+from evermap.maps.store.content import NAME_BYTES, DamagedError, is_chunk
 from evermap.maps.store.history import Record, ranges, read_pruned
 from evermap.maps.store.measured import looks_of
+from evermap.maps.store.packs import with_members
 from evermap.maps.store.protocol import DamagedMapError, Provenance
 from evermap.maps.store.sql import SqlStore, is_anchor
 
@@ -284,7 +285,7 @@ class _Found:
         anchor: tuple[int, bytes | None] | None = None
         pruned: dict[int, str] = {}
         candidates: dict[int, dict[bytes, Record]] = {}
-        for row in rows:
+        for row in with_members(rows):
             if is_anchor(row) and (anchor is None or row[3] > anchor[0]):
                 anchor, pruned = (row[3], row[4]), read_pruned((*row, None)[6])
             if len(row) != 2 or not isinstance(row[1], bytes):
@@ -292,7 +293,7 @@ class _Found:
             name, data = row
             if name is None or isinstance(name, int):
                 listed.add(data)
-            elif isinstance(name, bytes) and len(name) == NAME_BYTES and name not in chunks and _is_chunk(name, data):
+            elif isinstance(name, bytes) and len(name) == NAME_BYTES and name not in chunks and is_chunk(name, data):
                 chunks[name] = data
                 with suppress(DamagedError):
                     record = Record.of_text(content.read_text(name, data))
@@ -359,15 +360,6 @@ class _Found:
             return {name: self.chunks[name] for name in names}
         except KeyError:
             raise DamagedError("a part of it is missing or damaged") from None
-
-
-def _is_chunk(name: bytes, data: bytes) -> bool:
-    """Return whether stored bytes match their name, of any type."""
-    for dtype in DTYPES:
-        with suppress(DamagedError):
-            Chunk.of_stored(name, dtype, data)
-            return True
-    return False
 
 
 def _problems(path: Path) -> Iterator[str]:
