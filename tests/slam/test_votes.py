@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from space.halls import hall
+from space.test_range_noise import LAWS, field
 
 from evermap import run_slam
 from evermap.config import Config, SlamConfig, VotesConfig
@@ -111,3 +113,57 @@ def test_without_ids_or_odometry_there_is_no_vote():
     assert without_contradicted_ids(nameless, SLAM) is nameless
     in_space = replace(hall(1, n_points=40, n_frames=50), odometry=None)
     assert without_contradicted_ids(in_space, SLAM) is in_space
+
+
+def rig(*laws: str, seed: int = 3, **world):
+    """Two sensors, one ahead and one to the left."""
+    return field(seed, *[LAWS[law] for law in laws], n_frames=60, **world)
+
+
+def with_second(recording, change):
+    """Return the recording with other positions of what its second sensor saw."""
+    seen, own = recording.detections, recording.detections.sensor == 1
+    at = seen.position_sensor_m.copy()
+    at[own] = change(at[own])
+    return replace(recording, detections=replace(seen, position_sensor_m=at))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda at: 1.08 * at, id="scale"),
+        pytest.param(lambda at: Rotation.from_euler("z", 0.15).apply(at), id="turn"),
+        pytest.param(lambda at: at + [0.0, 0.5, 0.0], id="shift"),
+        pytest.param(lambda at: at * [-1.0, -1.0, 1.0], id="back to front"),
+    ],
+)
+def test_where_sensors_contradict_each_other_ids_are_right(change):
+    recording = with_second(rig("lidar", "lidar"), change)
+    found = without_contradicted_ids(recording, SLAM)
+    assert np.mean(found.detections.landmark_id == UNKNOWN) < 0.03
+    assert not any("two landmarks" in warning for warning in found.warnings)
+
+
+def test_where_a_sensor_is_late_ids_are_right():
+    found = without_contradicted_ids(rig("lidar", "lidar", late_s=0.2), SLAM)
+    assert np.mean(found.detections.landmark_id == UNKNOWN) < 0.03
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_ids_on_two_landmarks_show_between_two_sensors(shared):
+    """Five ids of two landmarks each, one seen ahead and one to the left; other landmarks are seen by both, or none."""
+    recording = rig("lidar", "lidar")
+    seen = recording.detections
+    views = np.zeros((2, 60, 40))
+    views[seen.sensor, seen.frame, seen.landmark_id] = 1.0
+    together, name, side = views[0].T @ views[1] - 100.0 * np.eye(40), np.arange(40), np.full(40, 2)
+    for _ in range(5):
+        one, other = np.unravel_index(together.argmax(), together.shape)
+        name[other], side[one], side[other] = one, 0, 1
+        together[[one, other]], together[:, [one, other]] = -100.0, -100.0
+    twin = side[seen.landmark_id] < 2
+    some = np.where(twin, side[seen.landmark_id] == seen.sensor, shared | (seen.landmark_id % 2 == seen.sensor))
+    recording = with_ids(recording, np.where(some, name[seen.landmark_id], UNKNOWN))
+    found = without_contradicted_ids(recording, SLAM).detections.landmark_id
+    assert np.mean(found[some & twin] == UNKNOWN) > 0.9
+    assert np.mean(found[some & ~twin] == UNKNOWN) < 0.03

@@ -29,6 +29,7 @@ from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
     AnyRecording,
+    BoolArray,
     FloatArray,
     Landmarks,
     Recording,
@@ -107,7 +108,7 @@ class Suspect:
         shown: the state as a user reads it: a ratio, seconds, metres, radians.
         of_map: whether it is of the given map.
         pairs: whether it shows in pairs of sightings of one landmark and the odometry between them.
-        rows: which landmarks it is of: an 'id', a 'class' or a 'size'; None of all.
+        rows: which detections it is of: those of an 'id', a 'class' or a 'size', or by a 'sensor'; None of all.
         shows: whether the readings alone say so, or nothing else than a solution can.
     """
 
@@ -270,7 +271,7 @@ def _seen_often(recording: AnyRecording) -> list[int]:
 
 
 def rows_of_kind(recording: AnyRecording, of: tuple[str, float] | None) -> Any:
-    """Return (M,) detections of an identity, of a class, or of tags of a size; all for None."""
+    """Return (M,) detections of an identity, of a class, by a sensor, or of tags of a size; all for None."""
     seen = recording.detections
     if of is None:
         return np.ones(len(seen), dtype=np.bool_)
@@ -279,6 +280,8 @@ def rows_of_kind(recording: AnyRecording, of: tuple[str, float] | None) -> Any:
         return seen.landmark_id == which
     if kind == "class":
         return seen.class_id == which
+    if kind == "sensor":
+        return seen.sensor == which  # type: ignore[union-attr]
     return np.isclose(seen.tag_size_m, which)  # type: ignore[union-attr]
 
 
@@ -404,6 +407,8 @@ def _in_space(recording: SpatialRecording, *, calibrations: bool, has_metre: boo
             lambda s: f"tag size of the detector x {math.exp(s):.4g}, or sigma_scale = {_round_up(abs(s))}",
             SCALE, _times,
         )  # fmt: skip
+    for row in np.flatnonzero(has_scale(recording)).tolist() if many else ():
+        yield _scale_of_sensor(row, sensors[row].name)
     if len(sizes) > 1:
         for size in sizes.tolist():
             yield _kind_size(f"size {size:g} m", _stretch_positions, ("size", size), f"{size:.12g}")
@@ -482,6 +487,25 @@ def _all_tags(size: str) -> Suspect:
         lambda s: (f"[tags] size_m = {float(size) * math.exp(s):.4g}" if size
                    else f"[tags] sizes x {math.exp(s):.4g}"),
         SCALE, _times,
+    )  # fmt: skip
+
+
+def has_scale(recording: SpatialRecording) -> BoolArray:
+    """Return (S,) sensors whose detections may have another scale; that of a camera that reads corners is its lens."""
+    seen, cameras = recording.detections, np.array([one.intrinsics is not None for one in recording.sensors])
+    measured = ~(cameras[seen.sensor] & np.isfinite(seen.corner_px[:, 0, 0]))
+    found = np.bincount(seen.sensor[measured], minlength=len(cameras)) > 0
+    return np.asarray(found & ~np.isin(np.arange(len(cameras)), seen.sensor[~measured]))
+
+
+def _scale_of_sensor(row: int, name: str) -> Suspect:
+    """Return that one of several sensors measures in another scale than the others."""
+    return Suspect(
+        "sensor-scale", name, USUAL_P, partial(_stretch_positions, of=("sensor", row)),
+        lambda s: f"{name} measures {math.exp(-s):.4g} times too {'long' if s < 0.0 else 'short'}: true distances are "
+        f"{math.exp(s):.4g} times those of its detections",
+        lambda s: f"detections.csv of {name}: x_m, y_m, z_m x {math.exp(s):.4g}",
+        SCALE, _times, rows=("sensor", row),
     )  # fmt: skip
 
 

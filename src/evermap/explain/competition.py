@@ -18,7 +18,7 @@ import numpy as np
 
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
-from evermap.explain.causes import LITTLE, MOUNT_M, Inputs, Suspect, list_suspects, rows_of_kind
+from evermap.explain.causes import LITTLE, MOUNT_M, Inputs, Suspect, has_scale, list_suspects, rows_of_kind
 from evermap.explain.evidence import (
     LOG_2PI,
     AnySession,
@@ -37,6 +37,7 @@ from evermap.explain.seeds import (
     find_mount,
     find_pair_loss,
     find_scales,
+    find_sensor_scales,
     find_shape,
     find_single_scales,
     late_by,
@@ -73,8 +74,8 @@ REFINED = 2
 """Trials whose states are refined: the best ones."""
 LINEAR = 4.0
 """Times that a cause may gain what the linear test says."""
-STRETCHES = frozenset({"tag-size", "range-scale"})
-"""Causes that stretch detections: of some landmarks as of all."""
+STRETCHES = frozenset({"tag-size", "range-scale", "sensor-scale"})
+"""Causes that stretch detections: of some landmarks, or by some sensors, as of all."""
 AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 ODOMETRY_OFF = 0.3
@@ -238,11 +239,19 @@ def find_symptoms(
         found.append("readings")
     if not found and _is_off_mount(result, inputs, config):
         found.append("mount")
+    if not found and (np.abs(_compare_sensors(inputs)) > LEAST_SCALE).any():
+        found.append("sensors")
     if not found:
         apart, _, longer = compare_odometry(result, inputs.recording.odometry)
         if apart > ODOMETRY_OFF or abs(math.log(max(longer, 1e-9))) > LENGTH_OFF or _is_odometry_noisy(result):
             found.append("odometry")
     return tuple(found)
+
+
+def _compare_sensors(inputs: Inputs) -> FloatArray:
+    """Return (S,) logarithms of true distances over those by each sensor in space, by the other sensors; else none."""
+    recording = inputs.recording
+    return find_sensor_scales(recording, has_scale(recording)) if is_in_space(recording) else np.zeros(0)
 
 
 def _is_odometry_noisy(result: SlamResult) -> bool:
@@ -709,13 +718,16 @@ def _by_seeds(
         single = find_single_scales(inputs.recording, result)
     slips = best is not None and _is_off_mount(best.solution.result, inputs, config)
     mount = find_mount(inputs.recording, config.check) if slips else np.zeros(3)  # type: ignore[arg-type]
+    by_sensor = _compare_sensors(inputs)
     found = list[tuple[float, Suspect, float]]()
     for suspect in suspects:
         if suspect.code == "mount" and suspect.subject in PLANAR_MOUNT and slips:
             moved = float(mount[PLANAR_MOUNT.index(suspect.subject)])
             found += [(math.inf, suspect, moved)] if abs(moved) > MOUNT_M else []
             continue
-        if suspect.rows is not None and suspect.rows[0] == "id":
+        if suspect.rows is not None and suspect.rows[0] == "sensor":
+            state = float(by_sensor[int(suspect.rows[1])])
+        elif suspect.rows is not None and suspect.rows[0] == "id":
             state = single.get(int(suspect.rows[1]), math.nan)
         elif suspect.rows is not None:
             of_kind = np.unique(inputs.recording.detections.landmark_id[rows_of_kind(inputs.recording, suspect.rows)])
@@ -724,10 +736,11 @@ def _by_seeds(
         else:
             seeds = {"range-scale": ranges, "tag-size": ranges, "odometry-scale": driven, "map-scale": of_map}
             state = seeds.get(suspect.code, math.nan)
-        if abs(state) > (LEAST_SCALE if suspect.rows is None else LEAST_SINGLE):
+        of_all = suspect.rows is None or suspect.rows[0] == "sensor"
+        if abs(state) > (LEAST_SCALE if of_all else LEAST_SINGLE):
             found.append((math.inf, suspect, state))
     # what was rejected stands out; of all lengths that which is off least is likelier
-    return sorted(found, key=lambda each: (each[1].rows is not None, abs(each[2])))
+    return sorted(found, key=lambda each: (each[1].rows is not None and each[1].rows[0] != "sensor", abs(each[2])))
 
 
 def _diverse(

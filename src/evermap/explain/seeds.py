@@ -1,6 +1,7 @@
 """First values of scales, by what needs no solution or no more of it than poses: a linear test may be far off there.
 
 * Two landmarks in one frame are as far apart as in the map: ranges against the map.
+* And as for another sensor at another time: ranges of one sensor against those of the others.
 * Two sightings of one landmark and the odometry between them: ranges against the odometry.
 * Landmarks of a solution that was not found in a map, against the map: all lengths.
 * Directions from several poses meet at the landmark, which says how far it was: ranges of one landmark.
@@ -19,12 +20,28 @@ import numpy as np
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
 from evermap.slam.mistakes import HONEST, Mistake, Pairs, find_motion, off, pairs_of
-from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Landmarks, Recording, SlamResult, is_in_space
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    Recording,
+    SlamResult,
+    is_in_space,
+)
 
 LARGEST, STEPS = 0.7, 141
 """Largest logarithm of a scale that is tried, and steps from the smallest to that."""
 APART_M, FEWEST_APART = 1.0, 8
 """Distance between two landmarks from which its ratio tells a scale, and how many of these it takes."""
+FEWEST_OF_PAIR, STEADY = 3, 0.03
+"""Times that a sensor must see two landmarks at once, and median deviation of the logarithm of their distance, up to
+which it is one that sensors can be compared by."""
+OF_MEDIAN, TIMES_SIGMA = 1.86, 5.0
+"""Standard deviation of a median of normal numbers, over their median deviation, and by their root; and times that from
+which it is not 0."""
 FEWEST_VIEWS, PARALLAX = 6, 0.02
 """Views of a landmark, and the least share of them that are crosswise, from which directions say how far it is."""
 LATEST_S, DELAY_STEP_S, DELAY_FINE_S = 5.0, 0.25, 0.01
@@ -89,6 +106,66 @@ def _against_map(recording: AnyRecording, given: Landmarks | None) -> float:
     given_m = np.linalg.norm(given.position_m[row[one], :dim] - given.position_m[row[other], :dim], axis=1)
     far = (seen_m > 0.1 * np.linalg.norm(at[one], axis=1)) & (given_m > 0.0)
     return float(np.median(np.log(given_m[far] / seen_m[far]))) if np.count_nonzero(far) >= FEWEST_APART else math.nan
+
+
+def find_sensor_scales(recording: AnyRecording, asked: BoolArray) -> FloatArray:
+    """Return (S,) logarithms of true distances over those that each sensor in space measures, if another one is right.
+
+    Two landmarks that are seen at once are as far apart for every sensor, wherever it is mounted and whenever it looks.
+    A sensor that agrees with another one has 0, and so has one of which nothing tells; of several others that it
+    contradicts it is compared with the nearest.
+
+    Args:
+        recording: with identities.
+        asked: (S,) sensors that are compared.
+    """
+    found = np.zeros(len(asked))
+    if not is_in_space(recording) or np.count_nonzero(asked) < 2:
+        return found
+    seen = recording.detections
+    at, known = positions_in_robot(recording)
+    rows = np.flatnonzero(known & asked[seen.sensor])
+    rows = rows[np.lexsort((seen.landmark_id[rows], seen.sensor[rows], seen.frame[rows]))]
+    pairs = [(rows[:-lag], rows[lag:]) for lag in (1, 2, 3) if lag < len(rows)]
+    if not pairs:
+        return found
+    one, other = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    apart_m, names = np.linalg.norm(at[one] - at[other], axis=1), seen.landmark_id
+    used = (seen.frame[one] == seen.frame[other]) & (seen.sensor[one] == seen.sensor[other])
+    used &= (names[one] != names[other]) & (apart_m > 0.1 * np.linalg.norm(at[one], axis=1))
+    one, other, log_m = one[used], other[used], np.log(apart_m[used])
+    pair = np.unique(np.column_stack([names[one], names[other]]), axis=0, return_inverse=True)[1].ravel()
+    table = _find_steady(log_m, pair, seen.sensor[one], len(asked))
+    for sensor in range(len(asked)):
+        off = [_find_level(others - table[sensor]) for k, others in enumerate(table) if k != sensor]
+        told = [one for one in off if math.isfinite(one)]
+        found[sensor] = min(told, key=abs, default=0.0)
+    return found
+
+
+def _find_steady(value: FloatArray, pair: IntArray, sensor: IntArray, n_sensors: int) -> FloatArray:
+    """Return (S, K) medians of the values of each pair by each sensor, nan where they are few, or scatter: distances of
+    what is seen with much noise are too long.
+    """
+    table = np.full((n_sensors, int(pair.max(initial=-1)) + 1), math.nan)
+    order = np.lexsort((pair, sensor))
+    key = sensor[order] * table.shape[1] + pair[order]
+    for mine in np.split(order, np.flatnonzero(np.diff(key)) + 1):
+        if len(mine) >= FEWEST_OF_PAIR:
+            middle = float(np.median(value[mine]))
+            if np.median(np.abs(value[mine] - middle)) < STEADY:
+                table[sensor[mine[0]], pair[mine[0]]] = middle
+    return table
+
+
+def _find_level(off: FloatArray) -> float:
+    """Return the median of differences, where it is significant 0 if not; nan where there are few."""
+    off = off[np.isfinite(off)]
+    if len(off) < FEWEST_APART:
+        return math.nan
+    level = float(np.median(off))
+    sigma = OF_MEDIAN * float(np.median(np.abs(off - level))) / math.sqrt(len(off))
+    return level if abs(level) > TIMES_SIGMA * sigma else 0.0
 
 
 def positions_in_robot(recording: AnyRecording) -> tuple[FloatArray, np.ndarray]:

@@ -3,7 +3,8 @@
 Carried to one pose by odometry, which is good for some seconds, detections of one landmark lie together. Several with
 one id, and none or hardly any with its own anywhere near, say that an id was read wrongly. How far detections of one
 landmark lie apart is told by those with one id, of which most are right. An id that is read at two places in one frame,
-time and again, is on two landmarks, and says nothing.
+time and again, is on two landmarks, and says nothing. But where one scale, turn and shift lays what one sensor sees
+over what another one does, it is a sensor that is wrong, not the ids.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from evermap.config import SlamConfig, VotesConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
+from evermap.geometry.rigid import rigid
 from evermap.slam.batch import sighted_at
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.intake import prepare
@@ -38,6 +40,8 @@ FIRST_QUARTILE = {2: 0.575, 3: 1.213}
 """First quartile of a squared standard normal vector, by its dimension: most ids are right, not all."""
 FEWEST_PAIRS, LEAST_SHARE = 20, 1e-4
 """Minimum detections of one id for learning their error, and minimum of its variance as a share of the above."""
+FEWEST_NAMES, STEPS = 3, 10
+"""Landmarks that two sensors must have seen at once to be laid over each other, and steps of that."""
 
 
 def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> AnyRecordingT:
@@ -105,25 +109,105 @@ def _in_space(recording: SpatialRecording, settings: SlamConfig) -> tuple[IntArr
     problem, boxes = intake.problem, np.isfinite(recording.detections.size_m).all(axis=1)
     voting = np.flatnonzero(~(boxes | without_range(recording))[intake.used])
     row, sensor = problem.pose_row[voting], problem.sensor[voting]
-    pose = se3.compose(intake.driven_pose[row], problem.mount[sensor])
-    at = se3.transform(pose, problem.measured[voting, :3])
+    name, ahead = problem.place[voting], se3.transform(problem.mount[sensor], problem.measured[voting, :3])
     variance = (np.linalg.inv(problem.measured_root[voting]) ** 2).sum(axis=(1, 2)) / 3.0
-    view = row * len(problem.mount) + sensor
-    return intake.used[voting], Read(at, variance, problem.stamp_s[row], view, problem.place[voting])
+    pose, view, stamp_s = intake.driven_pose[row], row * len(problem.mount) + sensor, problem.stamp_s[row]
+    if len(problem.mount) > 1:
+        by_sensor = name * len(problem.mount) + sensor
+        own = Read(se3.transform(pose, ahead), variance, stamp_s, view, by_sensor)
+        ahead = _lay_sensors(ahead, _learn_variance(own, settings.votes), row, sensor, name, settings.votes.gate)
+    return intake.used[voting], Read(se3.transform(pose, ahead), variance, stamp_s, view, name)
+
+
+def _lay_sensors(
+    ahead: FloatArray, variance: FloatArray, frame: IntArray, sensor: IntArray, name: IntArray, gate: float
+) -> FloatArray:
+    """Return positions (M, 3) in the robot's frame, those of sensors that contradict another laid over what it saw.
+
+    The sensor with the most detections is left where it is, and so are all of which that would mend less than half of
+    what is at two places: no one motion brings ids together that are on two landmarks.
+
+    Args:
+        ahead: (M, 3) positions in the robot's frame [m].
+        variance: (M,) of each.
+        frame: (M,) rows of frames.
+        sensor: (M,) rows of sensors.
+        name: (M,) rows of landmarks.
+        gate: standard deviations within which two detections are at one place.
+    """
+    count, ahead = np.bincount(sensor), ahead.copy()
+    left = np.flatnonzero(count).tolist()
+    left.sort(key=lambda one: -int(count[one]))
+    laid = left[:1]
+    while left := [one for one in left if one not in laid]:
+        pairs = {one: _pair(np.isin(sensor, laid), sensor == one, frame, name) for one in left}
+        after = max(left, key=lambda one: len(pairs[one]))
+        (here, there), laid = pairs[after].T, [*laid, after]
+        both = variance[here] + variance[there]
+
+        def count_apart(moved: FloatArray, here: IntArray = here, both: FloatArray = both) -> int:
+            squared = ((moved - ahead[here]) ** 2).sum(axis=1)
+            return int(np.count_nonzero(squared > 4.0 * gate**2 * both))
+
+        before = count_apart(ahead[there])
+        if not before or len(here) < FEWEST_PAIRS or len(np.unique(name[here])) < FEWEST_NAMES:
+            continue
+        scale, motion = _fit_similarity(ahead[there], ahead[here])
+        now = count_apart(se3.transform(motion, scale * ahead[there]))
+        if 2 * now < min(before, len(here)):
+            own = sensor == after
+            ahead[own] = se3.transform(motion, scale * ahead[own])
+    return ahead
+
+
+def _pair(some: BoolArray, others: BoolArray, frame: IntArray, name: IntArray) -> IntArray:
+    """Return (K, 2) rows of detections of one name in one frame: one of `some` (M,), and one of `others` (M,)."""
+    key = frame * (int(name.max()) + 1) + name
+    one, other = np.flatnonzero(some), np.flatnonzero(others)
+    _, a, b = np.intersect1d(key[one], key[other], return_indices=True)
+    return np.column_stack([one[a], other[b]])
+
+
+def _fit_similarity(source: FloatArray, target: FloatArray) -> tuple[float, FloatArray]:
+    """Return the scale, and the motion (7,) after it, that lay most of some points (K, 3) over others.
+
+    Least squares (Umeyama 1991) with Cauchy's weights, whose scale is the median distance.
+    """
+    weight = np.ones(len(source))
+    for _ in range(STEPS):
+        share = (weight / weight.sum())[:, None]
+        a, b = source - (share * source).sum(axis=0), target - (share * target).sum(axis=0)
+        turned = se3.transform(se3.turn(rigid(source, target, weight)[3:]), a)
+        scale = float((share * turned * b).sum() / max((share * a * a).sum(), 1e-12))
+        motion = rigid(scale * source, target, weight)
+        away = np.linalg.norm(se3.transform(motion, scale * source) - target, axis=1)
+        weight = 1.0 / (1.0 + (away / max(float(np.median(away)), 1e-9)) ** 2)
+    return scale, motion
 
 
 def contradicted(read: Read, settings: VotesConfig) -> tuple[BoolArray, BoolArray]:
     """Return which of M detections those of the seconds around contradict, and which of N names are at two places."""
-    at, variance, stamp_s, view, name = read
-    near = np.column_stack([np.searchsorted(stamp_s, stamp_s + sign * settings.window_s) for sign in (-1.0, 1.0)])
-    apart = _apart(at, variance, name, near)
-    apart = apart[np.isfinite(apart)]
-    if len(apart) >= FEWEST_PAIRS:
-        variance = variance * np.maximum(np.quantile(apart, 0.25) / FIRST_QUARTILE[at.shape[1]], LEAST_SHARE)
+    at, stamp_s, view, name = read.at, read.stamp_s, read.view, read.name
+    near, variance = _find_near(stamp_s, settings.window_s), _learn_variance(read, settings)
     own, others = _votes(at, variance, view, name, near, settings.gate)
     wrong = (others >= settings.fewest) & (others > settings.times * own)
     doubles = _doubles(at, variance, stamp_s, name, ~wrong & (own > 0), settings.gate)
     return wrong, doubles >= settings.fewest_doubles
+
+
+def _find_near(stamp_s: FloatArray, window_s: float) -> IntArray:
+    """Return (M, 2) first row within a window around each, and the one after the last."""
+    return np.column_stack([np.searchsorted(stamp_s, stamp_s + sign * window_s) for sign in (-1.0, 1.0)])
+
+
+def _learn_variance(read: Read, settings: VotesConfig) -> FloatArray:
+    """Return variances (M,) of detections by how far those with one name are apart, most of which are right."""
+    apart = _apart(read.at, read.variance, read.name, _find_near(read.stamp_s, settings.window_s))
+    apart = apart[np.isfinite(apart)]
+    if len(apart) < FEWEST_PAIRS:
+        return read.variance
+    level = np.quantile(apart, 0.25) / FIRST_QUARTILE[read.at.shape[1]]
+    return np.asarray(read.variance * np.maximum(level, LEAST_SHARE))
 
 
 @kernel

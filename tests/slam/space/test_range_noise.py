@@ -41,6 +41,7 @@ def field(
     outliers: float = 0.02,
     stated_m: float | None = None,
     drift: float = 0.02,
+    late_s: float = 0.0,
 ) -> SpatialRecording:
     """Drive through a field of points; each sensor looks ahead of the robot, the second one to its left.
 
@@ -52,18 +53,26 @@ def field(
         outliers: share of detections that are a metre off.
         stated_m: standard deviation that detections state; None where they state none.
         drift: of the odometry.
+        late_s: by how much what the last sensor sees is stamped late.
     """
     random = np.random.default_rng(seed)
     stamp_s, place = 0.4 * np.arange(n_frames), random.uniform((-5.0, -5.0, 0.0), (25.0, 20.0, 4.0), (n_points, 3))
-    angle = 5.0 * np.pi * np.arange(n_frames) / n_frames
-    at = np.column_stack([10.0 + 7.0 * np.cos(angle), 7.0 + 4.5 * np.sin(angle), 1.0 + 0.3 * np.sin(3.0 * angle)])
-    heading = np.unwrap(np.arctan2(4.5 * np.cos(angle), -7.0 * np.sin(angle)))
-    turn = Rotation.from_euler("ZYX", np.column_stack([heading, 0.05 * np.sin(np.outer(stamp_s, [0.9, 0.7]))]))
+
+    def drive(stamp_s: FloatArray) -> tuple[FloatArray, Rotation]:
+        angle = 5.0 * np.pi * stamp_s / (0.4 * n_frames)
+        at = np.column_stack([10.0 + 7.0 * np.cos(angle), 7.0 + 4.5 * np.sin(angle), 1.0 + 0.3 * np.sin(3.0 * angle)])
+        heading = np.unwrap(np.arctan2(4.5 * np.cos(angle), -7.0 * np.sin(angle)))
+        turn = Rotation.from_euler("ZYX", np.column_stack([heading, 0.05 * np.sin(np.outer(stamp_s, [0.9, 0.7]))]))
+        return at, turn
+
+    at, turn = drive(stamp_s)
+    from_where = [drive(stamp_s - (late_s if sensor == len(laws) - 1 else 0.0)) for sensor in range(len(laws))]
     pose, rows = poses(at, turn), []
     for row in range(n_frames):
         for sensor, law in enumerate(laws):
-            looks = turn[row] * Rotation.from_euler("z", 0.5 * np.pi * sensor)
-            ahead = looks.inv().apply(place - at[row])
+            eye, turned = from_where[sensor]
+            looks = turned[row] * Rotation.from_euler("z", 0.5 * np.pi * sensor)
+            ahead = looks.inv().apply(place - eye[row])
             range_m = np.linalg.norm(ahead, axis=1)
             seen = (range_m < FARTHEST_M) & (ahead[:, 0] > 0.8) & (random.random(n_points) < 0.6)
             for k in np.flatnonzero(seen):
