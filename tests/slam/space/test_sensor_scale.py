@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.slam.space.test_range_noise import LAWS, field
 
 from evermap import run_slam
 from evermap.explain.causes import has_scale
 from evermap.explain.seeds import find_sensor_scales
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import VerdictKind
+
+from .test_range_noise import LAWS, field
 
 
 def with_scale(recording, scale: float, turn_rad: float = 0.0):
