@@ -8,7 +8,6 @@ says where they are in it instead of having them.
 from __future__ import annotations
 
 import hashlib
-import lzma
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -42,6 +41,8 @@ def place_of(data: bytes) -> Place | None:
 
 def make_pack(stored: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
     """Return the rows of chunks, by name, with those of a pack of them; rows of their own if that is no shorter."""
+    import lzma  # a Python that was built without it opens all maps that are not packed
+
     values = [inflate(data) for data in stored.values()]
     single = {name: deflate(data) for name, data in stored.items()}
     whole = b"".join(values)
@@ -111,6 +112,8 @@ def _by_pack(rows: Iterable[tuple[bytes, bytes]]) -> dict[bytes, list[tuple[byte
 
 
 def _read_pack(name: bytes, data: bytes) -> bytes:
+    import lzma
+
     try:
         whole = lzma.decompress(data)
     except lzma.LZMAError as error:
