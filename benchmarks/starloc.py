@@ -365,6 +365,7 @@ class Kept:
 
     Attributes:
         route, seed: which.
+        found: whether the second session was localised; of one set aside nothing can be told, true or false.
         moved, told: tags that were moved, and those of them that are told as changed with more than .5.
         missed_m: distances of the moved ones that are not told.
         standing, false: tags that stand, and those of them that are told with more than .5.
@@ -373,6 +374,7 @@ class Kept:
 
     route: str
     seed: int
+    found: bool
     moved: int
     told: int
     missed_m: list[float]
@@ -419,7 +421,7 @@ def keep(route: str, first: SpatialRecording, second: SpatialRecording, living: 
     false = [(one, told[one][0], round(told[one][1], 3)) for one in standing.tolist() if one in says]
     missed = [round(float(np.linalg.norm(d)), 2) for one, d in zip(some.tolist(), by, strict=True) if one not in says]
     gone = [(one, p) for one, kind, p in false if kind == "vanished"]
-    return Kept(route, seed, len(some), len(some) - len(missed), missed, len(standing), false, gone)
+    return Kept(route, seed, session.found, len(some), len(some) - len(missed), missed, len(standing), false, gone)
 
 
 def _later(recording: SpatialRecording, by_s: float) -> SpatialRecording:
@@ -438,9 +440,14 @@ def print_maps(folder: Path, draws: int, only: list[str]) -> None:
         for seed in range(draws):
             found.append(keep(route, first, second, living, seed))
             print(found[-1], flush=True)
+    aside = sum(not row.found for row in found)
+    found = [row for row in found if row.found]
     moved, told, standing = (sum(getattr(row, one) for row in found) for one in ("moved", "told", "standing"))
     false, gone = sum(len(row.false) for row in found), sum(len(row.vanished) for row in found)
-    print(f"told {told} of {moved} moved; {false} false of {standing} tag-sessions, {gone} of them 'vanished'")
+    print(
+        f"told {told} of {moved} moved; {false} false of {standing} tag-sessions, "
+        f"{gone} of them 'vanished'; {aside} set aside"
+    )
 
 
 def main() -> None:
