@@ -33,6 +33,10 @@ enters sessions of one world after the other into a map: with identities, with t
 without. Since nothing says which of two equal landmarks moved, what is told is scored by places: one that a landmark
 left, or came to, within `NEAR_M` of the truth, one to one; a move is both. It is right if that happened since any
 earlier session, since a drive may see little of the site; and found at once if since the last.
+
+    python -m benchmarks.association sessions "half range"
+
+does so in two buildings, six sessions each, of a robot that sees half as far.
 """
 
 from __future__ import annotations
@@ -79,7 +83,7 @@ from evermap_studies.demo.truth import truth_of
 from evermap_studies.lifelong.runs import SIMULATED
 from evermap_studies.lifelong.world import recorded_world, simulated_world
 from evermap_studies.partial_views.study import Settings, building_of
-from evermap_studies.sim import simulate_warehouse
+from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building, simulate_warehouse
 from evermap_studies.sim.park import simulate_park
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data"
@@ -287,6 +291,10 @@ def worlds(folder: Path = FOLDER) -> Iterator[Lived]:
     for seed in range(1000, 1002):
         building = building_of(Settings(sessions=6), seed, 165)
         yield Lived(f"building, seed {seed}", building.sessions, truth_of(building).position_m)
+    for seed in range(1002, 1004):
+        sensor = SimulatedSensor(range_max_m=0.5 * SimulatedSensor().range_max_m)
+        building = simulate_building(BuildingConfig(days=6, sensor=sensor), seed)
+        yield Lived(f"half range, building {seed}", building.sessions, truth_of(building).position_m)
     for seed in range(BUILDINGS):
         story = story_of(seed, 7)
         driven = [day for day in range(7) if day % 7 != BY_HAND]

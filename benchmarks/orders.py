@@ -3,10 +3,12 @@
     python -m benchmarks.orders                          # 60 random ones of the 720 orders of six sessions
     python -m benchmarks.orders --orders 720 --patrol-s 20
     python -m benchmarks.orders --without-identities     # half of the landmarks are anonymous
+    python -m benchmarks.orders --worlds 50 --sessions 4 --orders 1 --patrol-s 90   # a late session in each of 50
 
 Of every order: beliefs and places, what each session tells and what changed between any two instants, and what the
 landmarks are called, each compared with the right order. Orders that begin alike share the file of their beginning, and
-`run_session` is asked once for the same recording and the same map, to the last bit.
+`run_session` is asked once for the same recording and the same map, to the last bit. With `--worlds` the orders of
+every world are other ones, none the right one; a line each, and the sums.
 """
 
 from __future__ import annotations
@@ -145,7 +147,8 @@ def compare(
 
     Returns:
         How many orders, how many of them differ and in what, in how many a session was refused (it shares too little
-        with those that came before it), and how often `run_session` was asked and run.
+        with those that came before it; all, where one is in the right order), and how often `run_session` was asked
+        and run.
     """
     asked, right = Asked(run=pipeline.run_session), tuple(range(len(sessions)))
     files: dict[tuple[int, ...], bytes | None] = {}
@@ -170,9 +173,10 @@ def compare(
         pipeline.run_session = asked  # type: ignore[assignment]
         try:
             wanted = story(right)
-            assert wanted is not None
             differing: dict[str, list[str]] = {}
             refused = 0
+            if wanted is None:  # nothing to compare with
+                wanted, orders, refused = {("called", 0.0): []}, [], len(orders)
             for order in sorted(orders):
                 found = story(order)
                 refused += found is None
@@ -183,7 +187,7 @@ def compare(
         finally:
             pipeline.run_session = asked.run
     told = sum(len(lines) for (question, _), lines in wanted.items() if question in ("told by", "since"))
-    counts = {"orders": len(orders), "refused": refused, "differing": differing, "changes": told}
+    counts = {"orders": max(len(orders), refused), "refused": refused, "differing": differing, "changes": told}
     return {**counts, "landmarks": len(wanted["called", 0.0]), "asked": asked.asked, "run": len(asked.answers)}
 
 
@@ -208,12 +212,31 @@ def _enter_again(store: MapStore, recording: Recording, config: em.Config | None
     raise AssertionError(f"{recording.name} enters twice")
 
 
-def orders_of(sessions: int, count: int, seed: int = 0) -> list[tuple[int, ...]]:
-    """Return random ones of all orders, or all."""
-    every = list(permutations(range(sessions)))
+def orders_of(sessions: int, count: int, seed: int = 0, *, late: bool = False) -> list[tuple[int, ...]]:
+    """Return random ones of all orders, or all; if `late`, never the right one."""
+    every = list(permutations(range(sessions)))[int(late) :]
     if count >= len(every):
         return every
     return [every[k] for k in np.random.default_rng(seed).choice(len(every), count, replace=False)]
+
+
+def late_in_worlds(
+    worlds: Sequence[int], sessions: int, orders: int, patrol_s: float, *, anonymous: bool = False
+) -> dict[str, Any]:
+    """Compare wrong orders with the right one in worlds of these seeds, and print a line of each.
+
+    Returns:
+        The sums of `compare`; `differing` by the seed and the order.
+    """
+    total: dict[str, Any] = {"worlds": 0, "differing": {}}
+    for seed in worlds:
+        recordings = sessions_of(sessions, patrol_s, seed, anonymous=anonymous)
+        found = compare(recordings, orders_of(sessions, orders, seed, late=True), ANONYMOUS if anonymous else None)
+        wrong = found.pop("differing")
+        print(json.dumps({"seed": seed, **found, "differing": wrong}), flush=True)
+        total["differing"] |= {f"{seed}: {order}": what for order, what in wrong.items()}
+        total |= {name: total.get(name, 0) + number for name, number in {"worlds": 1, **found}.items()}
+    return total
 
 
 def main() -> None:
@@ -223,10 +246,15 @@ def main() -> None:
     parser.add_argument("--orders", type=int, default=ORDERS)
     parser.add_argument("--patrol-s", type=float, default=PATROL_S)
     parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--worlds", type=int, default=0, help="seeds from --seed on, each with orders of its own")
     parser.add_argument("--without-identities", action="store_true")
     said = parser.parse_args()
-    sessions = sessions_of(said.sessions, said.patrol_s, said.seed, anonymous=said.without_identities)
-    found = compare(sessions, orders_of(said.sessions, said.orders), ANONYMOUS if said.without_identities else None)
+    if said.worlds:
+        seeds = range(said.seed, said.seed + said.worlds)
+        found = late_in_worlds(seeds, said.sessions, said.orders, said.patrol_s, anonymous=said.without_identities)
+    else:
+        sessions = sessions_of(said.sessions, said.patrol_s, said.seed, anonymous=said.without_identities)
+        found = compare(sessions, orders_of(said.sessions, said.orders), ANONYMOUS if said.without_identities else None)
     print(json.dumps(found, indent=1))
     raise SystemExit(bool(found["differing"]))
 

@@ -15,6 +15,12 @@ entries). Every row is a run by `run_slam`, or with `--audit` by `evermap audit`
 seen three times or more, and gtsam's error with the same survey. Design and held-out sessions and seeds are apart.
 
     python -m benchmarks.starloc --sweep [--held-out] [--audit] [--only SESSION..] [--kinds KIND..]
+
+With `--maps` both sessions of a route enter one map, and some tags are moved between them: their sightings in the
+second are displaced by what the truth of the rig says that they would have been. A moved tag that both saw three times
+or more is to be told; of the others, which stand, nothing is, and least of all that they vanished.
+
+    python -m benchmarks.starloc --maps [--draws 3] [--only ROUTE..]
 """
 
 from __future__ import annotations
@@ -353,6 +359,97 @@ def print_sweep(folder: Path, *, held_out: bool, audit: bool, only: list[str], k
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What a map of two sessions tells of tags, those that both saw three times or more.
+
+    Attributes:
+        route, seed: which.
+        found: whether the second session was localised; of one set aside nothing can be told, true or false.
+        moved, told: tags that were moved, and those of them that are told as changed with more than .5.
+        missed_m: distances of the moved ones that are not told.
+        standing, false: tags that stand, and those of them that are told with more than .5.
+        vanished: of these, those told as vanished: tag and probability.
+    """
+
+    route: str
+    seed: int
+    found: bool
+    moved: int
+    told: int
+    missed_m: list[float]
+    standing: int
+    false: list[tuple[int, str, float]]
+    vanished: list[tuple[int, float]]
+
+
+MOVED_SHARE, MOVED_M = 0.2, (0.1, 2.0)
+"""Tags moved between two sessions of a map, and how far: as likely in each octave."""
+
+
+def moved_tags(recording: SpatialRecording, tags: IntArray, by_m: FloatArray) -> SpatialRecording:
+    """Return the recording as if tags (T,) had stood elsewhere by (T, 3) in the frame of its truth."""
+    seen, truth = recording.detections, recording.truth
+    assert truth is not None
+    mount = np.array([one.mount_robot_sensor for one in recording.sensors])
+    camera = se3.compose(truth.pose_world_robot[seen.frame], mount[seen.sensor])
+    by = np.zeros((len(seen), 3))
+    for tag, one in zip(tags, by_m, strict=True):
+        by[seen.landmark_id == tag] = one
+    own = np.einsum("nji,nj->ni", se3.rotation_of(camera), by)
+    return replace(recording, detections=replace(seen, position_sensor_m=seen.position_sensor_m + own))
+
+
+def keep(route: str, first: SpatialRecording, second: SpatialRecording, living: Any, seed: int) -> Kept:
+    """Enter the second session of a route into the map of the first, with tags moved between them; score it."""
+    random = np.random.default_rng([seed, 7])
+    counts = [np.unique(one.detections.landmark_id, return_counts=True) for one in (first, second)]
+    tags = np.intersect1d(*(name[count >= FEWEST] for name, count in counts))
+    some = random.choice(tags, round(MOVED_SHARE * len(tags)), replace=False)
+    by = random.normal(size=(len(some), 3))
+    by /= np.linalg.norm(by, axis=1, keepdims=True)
+    by *= np.exp(random.uniform(*np.log(MOVED_M), (len(some), 1)))
+    away = float(first.frames.stamp_s[-1] - second.frames.stamp_s[0]) + 86_400.0
+    edited = replace(_later(moved_tags(second, some, by), away), truth=None, true_landmarks=None)
+    session = em.run_session(edited, living)
+    told: dict[int, tuple[str, float]] = {}
+    for change in session.changes:
+        for one in change.landmark_ids:
+            told[one] = max(told.get(one, ("", 0.0)), (change.kind.value, change.probability), key=lambda it: it[1])
+    says = {one for one, (_, p) in told.items() if p > 0.5}
+    standing = np.setdiff1d(tags, some)
+    false = [(one, told[one][0], round(told[one][1], 3)) for one in standing.tolist() if one in says]
+    missed = [round(float(np.linalg.norm(d)), 2) for one, d in zip(some.tolist(), by, strict=True) if one not in says]
+    gone = [(one, p) for one, kind, p in false if kind == "vanished"]
+    return Kept(route, seed, session.found, len(some), len(some) - len(missed), missed, len(standing), false, gone)
+
+
+def _later(recording: SpatialRecording, by_s: float) -> SpatialRecording:
+    return replace(recording, frames=replace(recording.frames, stamp_s=recording.frames.stamp_s + by_s))
+
+
+def print_maps(folder: Path, draws: int, only: list[str]) -> None:
+    """Print a line a map and draw of moves, and the sums."""
+    every = {name: recording for name, recording, *_ in recordings(folder) if not only or name[:-3] in only}
+    found = list[Kept]()
+    for name, first in every.items():
+        route, second = name[:-3], every.get(f"{name[:-3]}_s2")
+        if not name.endswith("_s1") or second is None:
+            continue
+        living = em.run_session(replace(first, truth=None, true_landmarks=None)).living
+        for seed in range(draws):
+            found.append(keep(route, first, second, living, seed))
+            print(found[-1], flush=True)
+    aside = sum(not row.found for row in found)
+    found = [row for row in found if row.found]
+    moved, told, standing = (sum(getattr(row, one) for row in found) for one in ("moved", "told", "standing"))
+    false, gone = sum(len(row.false) for row in found), sum(len(row.vanished) for row in found)
+    print(
+        f"told {told} of {moved} moved; {false} false of {standing} tag-sessions, "
+        f"{gone} of them 'vanished'; {aside} set aside"
+    )
+
+
 def main() -> None:
     """Print the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -360,9 +457,16 @@ def main() -> None:
     parser.add_argument("--sweep", action="store_true", help="edited surveys")
     parser.add_argument("--held-out", action="store_true", help="sessions and seeds that nothing was designed on")
     parser.add_argument("--audit", action="store_true", help="by `evermap audit`")
-    parser.add_argument("--only", nargs="*", default=[], help="sessions")
+    parser.add_argument("--only", nargs="*", default=[], help="sessions, or routes of maps")
+    parser.add_argument("--maps", action="store_true", help="two sessions in one map, tags moved between them")
+    parser.add_argument("--draws", type=int, default=3, help="of moved tags, a map")
     parser.add_argument("--kinds", nargs="*", default=[], help="of edits")
     chosen = parser.parse_args()
+    if not any(chosen.folder.glob("*/apriltag_cal_individual.csv.gz")):
+        raise SystemExit(f"no sessions of STAR-loc in {chosen.folder}: nothing is measured")
+    if chosen.maps:
+        print_maps(chosen.folder, chosen.draws, chosen.only)
+        return
     if chosen.sweep:
         print_sweep(chosen.folder, held_out=chosen.held_out, audit=chosen.audit, only=chosen.only, kinds=chosen.kinds)
         return
