@@ -28,7 +28,7 @@ def test_functions_depth_and_maps_are_those_that_a_call_enters(session_path: Mod
 
     path = session_path.trace(begin_twice)
     assert {"LivingMap.begun", "LivingMap.from_now_on", "Places.__post_init__"} <= set(path.functions["maps.living"])
-    assert "Tabular.__len__" in path.functions["types"]
+    assert "Tabular.__len__" in path.functions["types.arrays"]
     names = [name for module in path.functions.values() for name in module]
     assert not [name for name in names if name.endswith(">")]
     assert path.maps == 4
@@ -49,4 +49,4 @@ def test_an_exception_leaves_the_stack_as_it_was(session_path: ModuleType) -> No
             with pytest.raises(KeyError):
                 living.edited(7)
 
-    assert session_path.trace(fail_often).deepest == ("maps.living:LivingMap.edited", "types:Tabular.__len__")
+    assert session_path.trace(fail_often).deepest == ("maps.living:LivingMap.edited", "types.arrays:Tabular.__len__")
