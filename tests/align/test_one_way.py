@@ -18,6 +18,7 @@ OWN_FITS = {
     "maps/sessions/placing.py": "stretches of a bent session, reweighted",
     "maps/sessions/planar.py": "the motion by the places that a session was solved with",
     "metrics/trajectory.py": "the estimate to the truth",
+    "slam/votes.py": "what one sensor sees over what another sees of the same names",
     # identities are unknown: candidates by constellations
     "maps/sessions/box_search.py": "boxes",
     "maps/sessions/nameless.py": "landmarks without identities in a map",

@@ -25,6 +25,7 @@ GROUPS = {
         "why",
         "verify",
         "gc",
+        "compact",
         "reenter",
         "revert",
         "pin",

@@ -569,11 +569,11 @@ def gc(
 
 @app.command("compact")
 def compact(file: MapFile, as_json: AsJson = False) -> None:
-    """Shrink the file of a map: compress all revisions but the newest together. Nothing is lost.
+    """Shrink the file of a map, and lose nothing.
 
-    Every command answers as before, and later sessions give the same map; an evermap that is older than this command
-    cannot read the file any more. Sessions that come in afterwards are compressed by the next call. If the process is
-    killed, the map is as it was.
+    All revisions but the newest are compressed together. Every command answers as before, and later sessions give the
+    same map; an evermap that is older than this command cannot read the file any more. Sessions that come in afterwards
+    are compressed by the next call. If the process is killed, the map is as it was.
 
     \b
     Example:

@@ -51,7 +51,7 @@ _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections":
 _IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
 _LATER = (
     "features", "feature_names", "kind", "sigma_scale", "sigma_offset_m", "sigma_angle_rad", "sigma_position_m",
-    "sigma_odometer_scale", "sigma_askew_rad", "z_up", "is_measured",
+    "sigma_odometer_scale", "sigma_askew_rad", "z_up", "is_measured", "measures_positions",
 )  # fmt: skip
 """What is kept only where there is any: equal recordings have the bytes that they had before there was."""
 _PLAIN = ("name", "source", "class_names", "clock")
