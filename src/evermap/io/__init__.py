@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,14 @@ def add_reader(reader: Reader) -> None:
     _ADDED[:] = [reader, *(other for other in _ADDED if other.name != reader.name)]
 
 
-def find_readers() -> tuple[Reader, ...]:
-    """Return all readers in the order in which they are tried: added ones, those of evermap, those of packages."""
-    added = [*_ADDED, *(reader for reader in READERS if reader.name not in {one.name for one in _ADDED})]
-    return (*added, *(load(PLUGINS, name) for name in found(PLUGINS)))
+def find_readers() -> Iterator[Reader]:
+    """Yield all readers in the order in which they are tried: added ones, those of evermap, those of packages.
+
+    A package is imported only where no other reader was the one, so that one that is broken spoils no other format.
+    """
+    yield from _ADDED
+    yield from (reader for reader in READERS if reader.name not in {one.name for one in _ADDED})
+    yield from (load(PLUGINS, name) for name in found(PLUGINS))
 
 
 def reader_for(path: str | Path) -> Reader:
@@ -81,8 +85,7 @@ def reader_for(path: str | Path) -> Reader:
     sets = file_sets(path)
     if path.is_file():
         refuse_pointer(head_of(path), path)
-    readers = find_readers()
-    for reader in readers:
+    for reader in find_readers():
         if reader.matches(path):
             return reader
     if path.is_file() and not sets:
@@ -96,7 +99,7 @@ def reader_for(path: str | Path) -> Reader:
         raise InputError(f"is not a recording: it holds {kind.what}", path=path, hint=kind.hint)
     names = sorted(name for files in sets for name in files.members)
     holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
-    wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in readers)
+    wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in find_readers())
     raise InputError(f"no recording found, it contains {holds}; looked for {wanted}", path=path)
 
 
