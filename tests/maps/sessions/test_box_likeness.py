@@ -181,7 +181,7 @@ def test_spreads_of_sizes_are_learned_from_both_kinds_of_pairs() -> None:
     size_m = np.vstack([rng.normal(0.0, SAME_M / 3.0, (n_same, 3)), rng.normal(0.0, OTHER_M, (n_other, 3))])
     away_m = np.abs(np.append(rng.normal(0.0, 0.1, n_same), rng.normal(0.0, 0.5, n_other)))
     pairs = pair_boxes(away_m, size_m, p=0.8)
-    found = box_likeness._maximise(USUAL, pairs, USUAL)
+    found = box_likeness._maximise(USUAL, pairs, USUAL, np.zeros(0))
     np.testing.assert_allclose(found.same_size_m, SAME_M / 3.0, rtol=0.25)
     p_same = 1.0 / (1.0 + np.exp(-found.log_odds(pairs)[:, 0]))
     assert (p_same[:n_same] > 0.5).mean() > 0.97

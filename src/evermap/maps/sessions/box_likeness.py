@@ -178,13 +178,10 @@ def _find_empty(pairs: BoxPairs, known: MapBoxes) -> IntArray:
     return np.asarray(missed[first], dtype=np.int64)
 
 
-def _maximise(
-    found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness, p_empty: FloatArray | None = None
-) -> BoxLikeness:
+def _maximise(found: BoxLikeness, paired: BoxPairs, usual: BoxLikeness, p_empty: FloatArray) -> BoxLikeness:
     """The most probable one near to where it begins, by pairs (K, 1) of boxes that stand over each other, and beliefs
     (E,) in what stood where nothing is seen.
     """
-    p_empty = np.zeros(0) if p_empty is None else p_empty
     settings, size_m, away_m = usual.settings, paired.size_m[:, 0], paired.away_m[:, 0]
     sized = np.isfinite(size_m).all(axis=1)
     for _ in range(ROUNDS):

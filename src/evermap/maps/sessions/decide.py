@@ -125,8 +125,7 @@ def join_replaced(
         settings: how close to the former place the new one is.
     """
     living, before = entry.living, entry.before
-    nameless = np.array([landmark_id_of(one) for one in living.landmark_texts if is_anonymous(one)], dtype=np.int64)
-    nameless = nameless[~np.isin(nameless, what.landmark_id)]
+    nameless = _find_nameless(living, what)
     taken = [name for one in changes if one.kind not in COMES for name in one.landmark_ids]
     new = np.isin(entry.landmark_id, nameless) & ~np.isin(entry.landmark_id, [*before.members.landmark_id, *taken])
     left = [k for k, one in enumerate(changes) if one.kind is ChangeKind.VANISHED and len(one.landmark_ids) == 1]
@@ -157,6 +156,12 @@ def join_replaced(
     return (*told, *joined)
 
 
+def _find_nameless(living: LivingMap, what: Witnessed) -> IntArray:
+    """Return landmarks without identity, but for those that were seen to leave or arrive."""
+    nameless = np.array([landmark_id_of(one) for one in living.landmark_texts if is_anonymous(one)], dtype=np.int64)
+    return nameless[~np.isin(nameless, what.landmark_id)]
+
+
 def doubt_moves(
     changes: tuple[MapChange, ...], what: Witnessed, entry: Extended, config: LivingConfig
 ) -> tuple[MapChange, ...]:
@@ -173,8 +178,8 @@ def doubt_moves(
         config: how moves and replacements are.
     """
     living, moves, others = entry.living, config.overlay, config.boxes
-    nameless = {landmark_id_of(one) for one in living.landmark_texts if is_anonymous(one)}
-    nameless -= {*living.boxes.landmark_id.tolist(), *living.traits.landmark_id.tolist(), *what.landmark_id.tolist()}
+    told_by_looks = np.concatenate([living.boxes.landmark_id, living.traits.landmark_id])
+    nameless = np.setdiff1d(_find_nameless(living, what), told_by_looks)
     by_chance, told = density_of_unmet(living.places.position_m[entry.place]), list(changes)
     for k, one in enumerate(changes):
         if one.kind is not ChangeKind.MOVED or len(one.landmark_ids) > 1 or one.landmark_ids[0] not in nameless:
