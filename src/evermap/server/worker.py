@@ -118,7 +118,8 @@ class Worker:
                         verdict = entered.session.slam.verdict
                         kind = "" if verdict is None else verdict.kind.value
                         if refusal := entered.refusal(self._config):
-                            return JobOutcome(JobState.ASIDE, _without(kind, refusal), entered.parent, kind)
+                            reason = verdict.message if verdict is not None and refusal == verdict.text else refusal
+                            return JobOutcome(JobState.ASIDE, reason, entered.parent, kind)
                         took_s = time.perf_counter() - start
                         number = entered.commit(store, self._config, command="evermap work", wall_s=took_s)
                         return JobOutcome(JobState.ENTERED, _remark(entered.session.slam), number, kind)
@@ -162,11 +163,6 @@ def _remark(entered: SlamResult) -> str:
     verdict = entered.verdict
     said = [] if verdict is None or verdict.kind is VerdictKind.SOUND else [verdict.message]
     return ", ".join([*said, *entered.warnings[:3]])
-
-
-def _without(kind: str, refusal: str) -> str:
-    """Return a reason without the verdict that it begins with, which has a column of its own."""
-    return refusal.removeprefix(f"{kind}: ") if kind else refusal
 
 
 class Crew:
