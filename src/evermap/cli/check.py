@@ -22,6 +22,7 @@ from evermap.cli.options import (
 )
 from evermap.cli.terminal import (
     EXIT_UNTRUSTWORTHY,
+    EXIT_USER,
     echo,
     fail,
     print_json,
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.types import AnyRecording, Verdict
 
-EXIT_REFUSED = 2
-"""Of a recording that nothing can be estimated from."""
 UNASKED = "not asked by --quick: mounts, scales, delays below a second, mixed identities (try: without --quick)"
 """What the readings alone cannot tell."""
 
@@ -95,7 +94,7 @@ def check(
     if quick and usable:
         say(UNASKED)
     if found.is_refused:
-        raise typer.Exit(EXIT_REFUSED)
+        raise typer.Exit(EXIT_USER)
     if not usable:
         raise typer.Exit(EXIT_UNTRUSTWORTHY)
 

@@ -32,11 +32,10 @@ from evermap.cli import (
 )
 from evermap.cli import map as living_map
 from evermap.cli.options import Verb, name_options, option
-from evermap.cli.terminal import fail, say, warn
+from evermap.cli.terminal import EXIT_USER, fail, say, warn
 from evermap.errors import EvermapError, EvermapWarning
 
 EXIT_DEFECT = 1
-EXIT_USER = 2
 EXIT_INTERRUPTED = 130
 
 _show_any_warning = warnings.showwarning

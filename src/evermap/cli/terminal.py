@@ -35,6 +35,8 @@ _MOST = 2000
 """Maximum characters of an error; parts of a message have lower limits, so this cuts only other texts."""
 
 
+EXIT_USER = 2
+"""Of a mistake of the user, or a recording that nothing can be estimated from."""
 EXIT_UNTRUSTWORTHY = 3
 """Of a run whose verdict is none of 'sound' and 'weak'."""
 

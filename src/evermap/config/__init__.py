@@ -38,7 +38,6 @@ from evermap.config.section import (
     Share,
     config_error,
     key,
-    known_keys,
     part,
 )
 from evermap.config.sensor import (
@@ -146,7 +145,6 @@ __all__ = [
     "VotesConfig",
     "config_error",
     "key",
-    "known_keys",
     "load_config",
     "parse_config",
     "part",

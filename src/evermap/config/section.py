@@ -90,12 +90,12 @@ def _words_of(annotation: Any) -> list[str]:
     return [option for option in get_args(annotation) if isinstance(option, str)]
 
 
-def known_keys(section: type[Section], prefix: tuple[str, ...] = ()) -> Iterator[str]:
+def list_keys(section: type[Section], prefix: tuple[str, ...] = ()) -> Iterator[str]:
     """Yield the dotted names of all fields and of the sections that hold them."""
     for name, info in section.model_fields.items():
         yield ".".join((*prefix, name))
         if isinstance(info.annotation, type) and issubclass(info.annotation, Section):
-            yield from known_keys(info.annotation, (*prefix, name))
+            yield from list_keys(info.annotation, (*prefix, name))
 
 
 def _nearest_key(root: type[Section], names: list[str], value: Any) -> str:
@@ -106,7 +106,7 @@ def _nearest_key(root: type[Section], names: list[str], value: Any) -> str:
         names: of the key and the sections around it.
         value: that it was given; of a section that is not known, what that holds.
     """
-    known, inner = list(known_keys(root)), names
+    known, inner = list(list_keys(root)), names
     while isinstance(value, dict) and value:
         inner, value = [*inner, str(next(iter(value)))], next(iter(value.values()))
     for wanted in (inner, names):

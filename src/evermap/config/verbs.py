@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from evermap.config.section import Count, NotNegative, Positive, Probability, Section, key
-from evermap.types import DEFAULT_PRIOR
+from evermap.types import DEFAULT_P_FALSE, DEFAULT_P_MISS, DEFAULT_PRIOR
 
 
 class OutputConfig(Section):
@@ -68,8 +68,8 @@ class PersistConfig(Section):
     tail: float = key(
         0.025, "probability that a change lies before the interval given for it, and as much after it", gt=0.0, lt=0.5
     )
-    p_miss: Probability = key(0.1, "P(no detection | there) if the table has no p_miss")
-    p_false: Probability = key(0.1, "P(detection | not there) if the table has no p_false")
+    p_miss: Probability = key(DEFAULT_P_MISS, "P(no detection | there) if the table has no p_miss")
+    p_false: Probability = key(DEFAULT_P_FALSE, "P(detection | not there) if the table has no p_false")
     figures: int = key(12, "number of features with an individual figure", ge=0)
     rows_at_once: int = key(5_000_000, "rows that are held in memory; a larger Parquet table is done in parts", ge=1)
 

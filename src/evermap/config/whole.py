@@ -102,7 +102,7 @@ def refuse_unread(overrides: Iterable[str], unread: Mapping[str, Iterable[str]],
         ConfigError: names the first such key.
     """
     for override in overrides:
-        key = _dotted(override.partition("=")[0], within)
+        key = _complete_key(override.partition("=")[0], within)
         for why, names in unread.items():
             if any(f"{key}.".startswith(f"{name}.") for name in names):
                 raise ConfigError(f"would change nothing: not read {why}", field=key, hint="leave it out")
@@ -143,7 +143,7 @@ def _overridden(config: Config, overrides: Iterable[str], values: Mapping[str, A
 
 def _set(content: dict[str, Any], key: str, value: Any, within: str) -> None:
     """Write a value into nested dicts by its dotted key; one without a dot is of the section `within`."""
-    names = _dotted(key, within).split(".")
+    names = _complete_key(key, within).split(".")
     table: Any = content
     for name in names[:-1]:
         table = table.setdefault(name, {})
@@ -152,7 +152,7 @@ def _set(content: dict[str, Any], key: str, value: Any, within: str) -> None:
     table[names[-1]] = value
 
 
-def _dotted(key: str, within: str) -> str:
+def _complete_key(key: str, within: str) -> str:
     if within and "." not in key and key.strip() not in Config.model_fields:
         key = f"{within}.{key}"
     return ".".join(name.strip() for name in key.split("."))

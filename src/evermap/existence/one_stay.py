@@ -20,7 +20,7 @@ from evermap.existence.recursion import LARGEST, LOG_LARGEST, aged, observed, od
 from evermap.show import Shown
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, never_leaves, parse_prior
 from evermap.survival.text import prior_text
-from evermap.types import DEFAULT_PRIOR, BoolArray, FloatArray, IntArray
+from evermap.types import DEFAULT_P_FALSE, DEFAULT_P_MISS, DEFAULT_PRIOR, BoolArray, FloatArray, IntArray
 
 _ANSWERS = (0, 1)
 
@@ -79,7 +79,9 @@ class PersistenceFilter(Shown):
             raise self._refusal(stamp_s, 0.0, 0.0)
         return float(1.0 / (1.0 + aged(self._inverse_odds, self._death_odds(self._stamp, stamp_s))))
 
-    def update(self, stamp_s: float, detected: bool, p_miss: float = 0.1, p_false: float = 0.1) -> float:
+    def update(
+        self, stamp_s: float, detected: bool, p_miss: float = DEFAULT_P_MISS, p_false: float = DEFAULT_P_FALSE
+    ) -> float:
         """Take in one look at the feature, and return the probability that it exists then.
 
         Args:

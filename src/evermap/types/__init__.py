@@ -14,6 +14,8 @@ Conventions that hold everywhere:
 """
 
 from evermap.types.arrays import (
+    DEFAULT_P_FALSE,
+    DEFAULT_P_MISS,
     DEFAULT_PRIOR,
     UNKNOWN,
     ArrayTable,
@@ -77,6 +79,8 @@ __all__ = [
     "ANY_RANGE_M2",
     "CODE_DIGITS",
     "DEFAULT_PRIOR",
+    "DEFAULT_P_FALSE",
+    "DEFAULT_P_MISS",
     "MOST_TILT_RAD",
     "NOT_IN_SPACE",
     "PLANE",

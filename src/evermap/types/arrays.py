@@ -25,6 +25,8 @@ Progress = Callable[[float, float], None]
 
 UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""
+DEFAULT_P_MISS, DEFAULT_P_FALSE = 0.1, 0.1
+"""Error rates of a detector that states none."""
 DEFAULT_PRIOR = "unknown:1min..10y"
 """Lifetime of what nothing is known of, from a cup that is put down to a wall: every order of magnitude of the mean
 stay is equally likely."""

@@ -17,7 +17,7 @@ from evermap.io.columns import Columns, DataFrame, TableSource, natural_order, p
 from evermap.io.table import arrow_cells, pa, pq
 from evermap.io.text import counted, quote
 from evermap.show import Shown
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
+from evermap.types import DEFAULT_P_FALSE, DEFAULT_P_MISS, UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import STAMP_S, Quantity
 
 _REQUIRED = ("stamp_s", "feature_id", "detected")
@@ -195,7 +195,7 @@ class Truth:
         return answer
 
 
-def read_looks(source: TableSource, *, p_miss: float = 0.1, p_false: float = 0.1) -> LookTable:
+def read_looks(source: TableSource, *, p_miss: float = DEFAULT_P_MISS, p_false: float = DEFAULT_P_FALSE) -> LookTable:
     """Return a table with `stamp_s, feature_id, detected` and perhaps `p_miss, p_false, class_id, present`.
 
     Args:
