@@ -60,7 +60,7 @@ class Move:
         return round(math.hypot(*self.by_m), 3)
 
 
-def moved_world(
+def move_landmarks(
     seed: int, sessions: int = SESSIONS, each: int = EACH, sizes_m: Sequence[float] = SIZES_M
 ) -> tuple[list[Recording], list[Move]]:
     """Simulate a building, and move landmarks between its sessions; each at most once."""
@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=EACH, help="moves of each size between two sessions")
     said, rows = parser.parse_args(), list[dict[str, Any]]()
     for seed in range(said.seed, said.seed + said.worlds):
-        rows.append(live(*moved_world(seed, each=said.each)))
+        rows.append(live(*move_landmarks(seed, each=said.each)))
         found = [sum(one["found"] for one in rows[-1]["moves"] if one["size_m"] == size) for size in SIZES_M]
         print(json.dumps({"seed": seed, "found": found, "sessions": rows[-1]["found"], "false": rows[-1]["false"]}),
               flush=True)  # fmt: skip

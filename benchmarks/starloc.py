@@ -387,7 +387,7 @@ MOVED_SHARE, MOVED_M = 0.2, (0.1, 2.0)
 """Tags moved between two sessions of a map, and how far: as likely in each octave."""
 
 
-def moved_tags(recording: SpatialRecording, tags: IntArray, by_m: FloatArray) -> SpatialRecording:
+def move_tags(recording: SpatialRecording, tags: IntArray, by_m: FloatArray) -> SpatialRecording:
     """Return the recording as if tags (T,) had stood elsewhere by (T, 3) in the frame of its truth."""
     seen, truth = recording.detections, recording.truth
     assert truth is not None
@@ -410,7 +410,7 @@ def keep(route: str, first: SpatialRecording, second: SpatialRecording, living: 
     by /= np.linalg.norm(by, axis=1, keepdims=True)
     by *= np.exp(random.uniform(*np.log(MOVED_M), (len(some), 1)))
     away = float(first.frames.stamp_s[-1] - second.frames.stamp_s[0]) + 86_400.0
-    edited = replace(_later(moved_tags(second, some, by), away), truth=None, true_landmarks=None)
+    edited = replace(_later(move_tags(second, some, by), away), truth=None, true_landmarks=None)
     session = em.run_session(edited, living)
     told: dict[int, tuple[str, float]] = {}
     for change in session.changes:

@@ -150,7 +150,7 @@ def test_poses_that_are_kept_are_those_of_the_same_corners_sizes_and_lens(monkey
     asked: list[SpatialSensor] = []
     compute = square._square_poses
     monkeypatch.setattr(square, "_square_poses", lambda *given: asked.append(given[2]) or compute(*given))
-    square._kept_poses.cache_clear()
+    square._solve_once.cache_clear()
 
     def check(number: int, corner: np.ndarray, size: np.ndarray, sensor: SpatialSensor) -> None:
         found = square_poses(corner, size, sensor)

@@ -159,7 +159,7 @@ def _find_steady(value: FloatArray, pair: IntArray, sensor: IntArray, n_sensors:
 
 
 def _find_level(off: FloatArray) -> float:
-    """Return the median of differences, where it is significant 0 if not; nan where there are few."""
+    """Return the median of differences, 0 where it is not significant; nan where they are few."""
     off = off[np.isfinite(off)]
     if len(off) < FEWEST_APART:
         return math.nan

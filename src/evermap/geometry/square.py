@@ -53,11 +53,11 @@ def square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSenso
     )
     if len(size_m) > _FEW:
         return _square_poses(corner_px, size_m, lens)
-    return _kept_poses(corner_px.tobytes(), size_m.tobytes(), lens)
+    return _solve_once(corner_px.tobytes(), size_m.tobytes(), lens)
 
 
 @functools.lru_cache(maxsize=16)
-def _kept_poses(corner_px: bytes, size_m: bytes, lens: SpatialSensor) -> SquarePoses:
+def _solve_once(corner_px: bytes, size_m: bytes, lens: SpatialSensor) -> SquarePoses:
     found = _square_poses(np.frombuffer(corner_px).reshape(-1, 4, 2), np.frombuffer(size_m), lens)
     for array in found:
         array.flags.writeable = False

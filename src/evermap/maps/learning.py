@@ -112,7 +112,7 @@ class History:
         average.
         """
         chances, events = (self.counts(self.recent & rows, self.stays.p_gone) for rows in (chance, event & chance))
-        return self._leaned(events, chances)
+        return self._lean(events, chances)
 
     def share_known(self) -> FloatArray:
         """Return (C + 1,) probability that who turns up again does so at a known site, as `believe.dynamics_of` takes
@@ -126,10 +126,10 @@ class History:
         p = np.full(len(chances), 0.5)
         for _ in range(EM_STEPS):
             unseen = n_hops * p / (2.0 - p)
-            p = self._leaned(events + unseen, chances + unseen)
+            p = self._lean(events + unseen, chances + unseen)
         return p
 
-    def _leaned(self, events: FloatArray, chances: FloatArray) -> FloatArray:
+    def _lean(self, events: FloatArray, chances: FloatArray) -> FloatArray:
         """Return (C + 1,) shares of events in chances (C + 1,), which lean on their average."""
         # classes differ: every one counts for one event at most, however often it was seen
         weight = 1.0 / (chances[:-1] + self._strength)
