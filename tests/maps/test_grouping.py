@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import dblquad, quad
 from scipy.spatial.distance import pdist
 from scipy.stats import multivariate_normal
 
@@ -73,6 +73,36 @@ def test_evidence_of_a_motion_is_the_integral_over_all(turn_rad: float) -> None:
 
     truth = quad(density, turn_rad - 0.5, turn_rad + 0.5, points=[turn_rad], limit=200)[0]
     assert log_evidence_of_motion(before, after, covariance) == pytest.approx(np.log(truth), abs=0.02)
+
+
+def test_evidence_of_a_pair_in_space_is_the_integral_over_all_its_directions() -> None:
+    """A pair has no turn about its own line, so all that a motion leaves free is a direction: even on the sphere."""
+    before = np.array([[0.0, 0.0, 0.0], [0.7, 0.0, 0.0]])
+    after = np.array([[1.0, -0.5, 0.2], [1.0, 0.21, 0.22]])
+    wide = np.eye(6) * SIGMA_M**2 + np.kron(np.ones((2, 2)), USUAL.move_sigma_m**2 * np.eye(3))
+    way = after[1] - after[0]
+    way /= np.linalg.norm(way)
+    across = np.linalg.svd(way[None])[2][1:]
+
+    def density(a: float, b: float) -> float:
+        arm = 0.35 * (way * np.sqrt(1.0 - a * a - b * b) + a * across[0] + b * across[1])
+        mean = before.mean(axis=0) + np.array([-arm, arm])
+        area = 1.0 / np.sqrt(1.0 - a * a - b * b)
+        return float(multivariate_normal.pdf(after.ravel(), mean.ravel(), wide)) * area / (4.0 * np.pi)
+
+    truth = dblquad(density, -0.4, 0.4, -0.4, 0.4, epsrel=1e-6)[0]
+    covariance = np.tile(SIGMA_M**2 * np.eye(3), (2, 1, 1))
+    assert log_evidence_of_motion(before, after, covariance) == pytest.approx(np.log(truth), abs=0.02)
+
+
+def test_evidence_of_many_bodies_is_that_of_each() -> None:
+    rng = np.random.default_rng(4)
+    for dim in (2, 3):
+        before, after = rng.normal(size=(2, 5, 3, dim))
+        root = rng.normal(size=(5, 3, dim, dim))
+        covariance = 0.01 * (np.eye(dim) + root @ np.swapaxes(root, -1, -2))
+        each = [float(log_evidence_of_motion(*one)) for one in zip(before, after, covariance, strict=True)]
+        np.testing.assert_allclose(log_evidence_of_motion(before, after, covariance), each, rtol=1e-12)
 
 
 def test_evidence_of_one_landmark_is_a_normal_density() -> None:

@@ -37,10 +37,8 @@ class OverlayConfig(RoomConfig):
 
     nudge_m: Positive = key(0.7, "standard deviation of a small move, each axis [m]")
     share_nudged: Share = key(0.5, "share of moves that are small; the others are unbounded")
-    turn_m: Positive = key(0.35, "standard deviation of the rotation of a moved body, at its members [m]")
     share_turned: Share = key(0.1, "share of moves in space that are turns of a landmark in its place")
     turned_m: Positive = key(0.05, "standard deviation of the position of one turned in its place, each axis [m]")
-    p_split: Share = key(1e-3, "probability that landmarks assigned to one body are not")
     drifts_m: tuple[Positive, ...] = key(
         (0.01, 0.02, 0.04, 0.08),
         "candidate standard deviations of unmoved landmarks from session to session, the likeliest first [m]",

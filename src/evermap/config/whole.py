@@ -65,7 +65,10 @@ def load_config(
     return _overridden(_validate(_read_toml(source), source), overrides, values or {}, within)
 
 
-RETIRED = ("living.lifetimes.prior_quantiles", "living.lifetimes.prior_shortest_s", "living.lifetimes.prior_longest_s")
+RETIRED = (
+    "living.lifetimes.prior_quantiles", "living.lifetimes.prior_shortest_s", "living.lifetimes.prior_longest_s",
+    "living.overlay.turn_m", "living.overlay.p_split",
+)  # fmt: skip
 """Keys of earlier versions which nothing reads any more; maps keep them with the settings of their sessions."""
 
 

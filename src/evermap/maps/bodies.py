@@ -32,8 +32,8 @@ from evermap.maps.living import LivingMap, Sites
 from evermap.types import BoolArray, FloatArray, IntArray
 
 USUAL = GroupingConfig()
-TURN_INFORMATION = 1e-6
-"""Of rotations, since landmarks may be at one point, or in space on one line."""
+TURN_INFORMATION = 1.0 / (2.0 * math.pi)
+"""Of a turn that nothing holds, of landmarks at one point, or in space on one line: a Gaussian as wide as a circle."""
 ALL_TURNS = {2: 2.0 * math.pi, 3: 8.0 * math.pi**2}
 """Volume of all rotations of the plane and of space."""
 
@@ -110,7 +110,7 @@ def regrouped(
     @functools.cache
     def log_evidence(rows: tuple[int, ...]) -> float:
         before_m, after_m, covariance_m2 = (part[list(rows)] for part in displaced)
-        return log_evidence_of_motion(before_m, after_m, covariance_m2, settings.move_sigma_m)
+        return float(log_evidence_of_motion(before_m, after_m, covariance_m2, settings.move_sigma_m))
 
     label, moved, one_body = clique_id.copy(), [], _logit(settings.p_one_body)
     for name in np.unique(clique_id[fate != Fate.UNSEEN]):
@@ -170,45 +170,50 @@ def _joined(
 
 def log_evidence_of_motion(
     before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray, sigma_m: float = USUAL.move_sigma_m
-) -> float:
-    """Return `log p(after | before)` if one rigid motion made it all: any turn, the middle moved by `sigma_m` each
-    axis.
+) -> FloatArray:
+    """Return (...,) `log p(after | before)` of bodies, if one rigid motion made all of each: any turn, the middle moved
+    by `sigma_m` each axis.
 
     Of one landmark exact, of more by Laplace's method about the most probable motion.
 
     Args:
-        before_m: (n, 2) old places; with 3 for 2 in space, here and below.
-        after_m: (n, 2) new places.
-        covariance_m2: (n, 2, 2) of each difference.
+        before_m: (..., n, 2) old places; with 3 for 2 in space, here and below.
+        after_m: (..., n, 2) new places.
+        covariance_m2: (..., n, 2, 2) of each difference.
         sigma_m: standard deviation of displacements, each axis.
     """
-    count = len(before_m)
+    lead, count, axes = before_m.shape[:-2], before_m.shape[-2], before_m.shape[-1]
     if count == 1:
-        spread = covariance_m2[0] + sigma_m**2 * np.eye(before_m.shape[1])
-        return float(log_density(after_m - before_m, spread[None])[0])
-    middle, new_middle = before_m.mean(axis=0), after_m.mean(axis=0)
-    group = PLANE if before_m.shape[1] == PLANE.point_dim else SPACE
-    axes, turns = group.point_dim, group.dim - group.point_dim
+        spread = covariance_m2[..., 0, :, :] + sigma_m**2 * np.eye(axes)
+        return log_density(after_m[..., 0, :] - before_m[..., 0, :], spread)
+    middle, new_middle = before_m.mean(axis=-2, keepdims=True), after_m.mean(axis=-2, keepdims=True)
+    group = PLANE if axes == PLANE.point_dim else SPACE
+    turns = group.dim - group.point_dim
     arm = before_m - middle
     motion = rigid(arm, after_m - new_middle)  # Gauss-Newton from the rotation that suits equal variances best
-    turn, shift = group.rotation_of(motion), new_middle - middle
+    turn, shift = group.rotation_of(motion), (new_middle - middle)[..., 0, :]
     precision = np.linalg.inv(covariance_m2)
     prior = np.diag(np.repeat([sigma_m**-2, TURN_INFORMATION], [axes, turns]))
+
+    def residual_of(turned: FloatArray) -> FloatArray:
+        return np.asarray(after_m - middle - shift[..., None, :] - turned)
+
     for _ in range(5):
-        turned = arm @ turn.T
-        jacobian = group.rigid_directions(turned).reshape(count, axes, group.dim)
-        residual = after_m - middle - shift - turned
-        information = np.einsum("nia,nij,njb->ab", jacobian, precision, jacobian) + prior
-        slope = np.einsum("nia,nij,nj->a", jacobian, precision, residual)
-        slope[:axes] -= shift / sigma_m**2
-        step = np.linalg.solve(information, slope)
-        shift = shift + step[:axes]
-        turn = group.rotation_of(group.exp(np.append(np.zeros(axes), step[axes:]))) @ turn
-    residual = after_m - middle - shift - arm @ turn.T
-    log_likelihood = float(np.sum(log_density(residual, covariance_m2)))
-    log_prior = -0.5 * float(shift @ shift) / sigma_m**2 - 0.5 * axes * math.log(2.0 * math.pi * sigma_m**2)
-    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * float(np.linalg.slogdet(information)[1])
-    return log_likelihood + log_prior - math.log(ALL_TURNS[axes]) + log_width
+        turned = arm @ np.swapaxes(turn, -1, -2)
+        jacobian = group.rigid_directions(turned.reshape(-1, axes)).reshape(*lead, count, axes, group.dim)
+        weighted = np.swapaxes(jacobian, -1, -2) @ precision
+        information = (weighted @ jacobian).sum(axis=-3) + prior
+        slope = (weighted @ residual_of(turned)[..., None]).sum(axis=-3)[..., 0]
+        slope[..., :axes] -= shift / sigma_m**2
+        step = np.linalg.solve(information, slope[..., None])[..., 0]
+        shift = shift + step[..., :axes]
+        twist = np.concatenate([np.zeros((*lead, axes)), step[..., axes:]], axis=-1)
+        turn = group.rotation_of(group.exp(twist)) @ turn
+    residual = residual_of(arm @ np.swapaxes(turn, -1, -2))
+    log_likelihood = log_density(residual, covariance_m2).sum(axis=-1)
+    log_prior = -0.5 * (shift**2).sum(axis=-1) / sigma_m**2 - 0.5 * axes * math.log(2.0 * math.pi * sigma_m**2)
+    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * np.linalg.slogdet(information)[1]
+    return np.asarray(log_likelihood + log_prior - math.log(ALL_TURNS[axes]) + log_width)
 
 
 def squared_length(off: FloatArray, covariance: FloatArray) -> FloatArray:

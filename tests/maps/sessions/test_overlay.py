@@ -107,7 +107,7 @@ def test_probability_is_that_of_a_clique_given_the_others(seed: int) -> None:
 def test_what_agrees_with_what_stands_is_added_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """From three of sixty to all of them in a few steps, not in sixty: sessions have hundreds."""
     one = world(np.random.default_rng(8), [1] * 60, [1] * 60, [0] * 60)
-    options = _Options(one.sighted, one.known, agreed(one), USUAL)
+    options = _Options(one.sighted, one.known, agreed(one), USUAL, 0.9)
     asked = []
     scores = options._scores
     monkeypatch.setattr(options, "_scores", lambda chosen: asked.append(chosen) or scores(chosen))
@@ -187,6 +187,46 @@ def test_one_of_a_body_that_left_it_is_taken_out_of_it() -> None:
     # only the joint search asks who belongs together
     gated = laid(one, "gate")
     assert (gated.place[4:] == ELSEWHERE).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("along_m", [0.15, 0.3])
+def test_one_of_two_side_by_side_moves_without_the_other(dim: int, along_m: float) -> None:
+    """Away from its neighbour, to which it was grouped: no rigid motion changes the distance of two."""
+    one = world(np.random.default_rng(31), [1] * 6 + [2], [1] * 7, [0] * 7, sigma_m=0.01, dim=dim)
+    line = one.sighted.position_m[7] - one.sighted.position_m[6]
+    one.sighted.position_m[7] += along_m * line / np.linalg.norm(line)
+    about = None if dim == 2 else one.pose_map_session
+    found = lay_over(one.sighted, one.known, motion=about)
+    assert found is not None
+    assert np.flatnonzero(found.place < 0).tolist() == [7]
+    assert found.probability[7] > 0.99
+    assert found.drift_m <= 0.02, "what it moved by is no drift of all others"
+
+
+def test_a_body_that_turned_moved_as_one() -> None:
+    """Both of its landmarks are elsewhere, as far apart as ever: they are not taken apart."""
+    one = world(np.random.default_rng(32), [1] * 6 + [2], [1] * 7, [0] * 7, sigma_m=0.01)
+    pair = one.sighted.position_m[6:]
+    one.sighted.position_m[6:] = pair.mean(axis=0) + (pair - pair.mean(axis=0)) @ se2.rotation(1.2).T + [0.3, 0.1]
+    options = _Options(one.sighted, one.known, agreed(one), USUAL, 0.9)
+    found = laid(one)
+    assert np.flatnonzero(found.place < 0).tolist() == [6, 7]
+    assert options.log_odds_apart(np.array([0, 1, 2, 3, 4, 5, ELSEWHERE]))[6] < -2.0
+
+
+def test_how_probably_neighbours_are_one_body_is_part_of_the_odds() -> None:
+    """That they moved by nearly the same speaks for one body; what was believed before is added to that."""
+    one = world(np.random.default_rng(33), [1] * 6 + [2], [1] * 7, [0] * 7, sigma_m=0.01)
+    one.sighted.position_m[6:] += [[0.25, 0.0], [0.21, 0.0]]
+    moved = np.array([0, 1, 2, 3, 4, 5, ELSEWHERE])
+
+    def log_odds(p_one_body: float) -> float:
+        return float(_Options(one.sighted, one.known, agreed(one), USUAL, p_one_body).log_odds_apart(moved)[6])
+
+    assert log_odds(0.5) - log_odds(0.9) == pytest.approx(np.log(5.0))
+    assert log_odds(0.9) < -2.0
+    assert np.flatnonzero(laid(one).place < 0).tolist() == [6, 7]
 
 
 def test_a_search_for_nothing_leaves_each_at_its_most_probable_site() -> None:

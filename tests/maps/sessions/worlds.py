@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evermap.geometry.group import PLANE, SPACE
+from evermap.maps.bodies import log_evidence_of_motion
 from evermap.maps.sessions.overlay import (
     ELSEWHERE,
     USUAL,
@@ -137,7 +138,9 @@ class Densely:
         slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(len(free))])
         basis, _ = np.linalg.qr(slope)  # what the session says of its own motion is part of that freedom
         turn = turn - basis @ basis.T @ turn
-        self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(free**2) @ slope.T
+        self._of_moved = dict[tuple[int, float], float]()
+        self.own = turn @ sighted.covariance_m2 @ turn.T
+        self.spread = self.own + slope @ np.diag(free**2) @ slope.T
         both = np.vstack([self.at, known.position_m])
         extent = both.max(axis=0) - both.min(axis=0)
         self.room_m2 = max(float(np.prod(extent[:2])), USUAL.smallest_room_m2)
@@ -183,21 +186,25 @@ class Densely:
             elif site >= 0:
                 total += float(known.log_p_site[site] + known.log_turned[known.site == site].sum())
             elif self.sites[clique]:
-                total += float(known.log_p_elsewhere[clique]) + max(self._moved(s) for s in self.sites[clique])
+                total += float(known.log_p_elsewhere[clique]) + max(self._moved(s, drift_m) for s in self.sites[clique])
         return total
 
     def is_this_place(self, chosen: IntArray, drift_m: float) -> bool:
         """Against another place, one session in a thousand, where what stands stands anywhere in the room."""
-        moved = sum(max(self._moved(s) for s in self.sites[c]) for c, site in enumerate(chosen) if site < 0)
+        moved = sum(max(self._moved(s, drift_m) for s in self.sites[c]) for c, site in enumerate(chosen) if site < 0)
         standing = int(np.isin(self.known.site, chosen[chosen >= 0]).sum() + np.sum(chosen >= self.TURNED))
         return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
 
     def best(self) -> tuple[IntArray, float, float]:
-        """The most probable assignment, the drift with it, and by how much the next one is less probable."""
+        """The most probable assignment, the drift with it, and by how much the next one is less probable.
+
+        Of those in which two landmarks stand: of fewer no motion follows.
+        """
         scored = sorted(
             (
                 (self.log_probability(chosen, drift) + k * math.log(USUAL.p_coarser), tuple(chosen), drift)
                 for chosen in self.assignments()
+                if np.isin(self.known.site, chosen[chosen >= 0]).sum() >= 2
                 for k, drift in enumerate((*USUAL.drifts_m, *(USUAL.drifts_in_space_m if self.dim == 3 else ())))
             ),
             reverse=True,
@@ -206,21 +213,25 @@ class Densely:
         other = next(v for v, c, _ in scored if c != chosen)
         return np.array(chosen), drift, value - other
 
-    def _moved(self, site: int) -> float:
-        """Density of a body's landmarks beside one of its sites: nudged or anywhere as a whole, turned a little."""
+    def _moved(self, site: int, drift_m: float) -> float:
+        """Density of a body's landmarks beside one of its sites: one rigid motion, of its middle by little or anywhere.
+
+        The evidence of a motion has its own test, against the integral over all of them.
+        """
+        if (site, drift_m) in self._of_moved:
+            return self._of_moved[site, drift_m]
         rows = np.flatnonzero(self.known.site == site)
-        step = self.at[self.known.landmark[rows]] - self.known.position_m[rows]
-        middle = step.mean(axis=0)
-        scale = (2.0 * math.pi * USUAL.nudge_m**2) ** (0.5 * self.dim)
-        nudged = math.exp(-0.5 * float(middle @ middle) / USUAL.nudge_m**2) / scale
-        whole = math.log(USUAL.share_nudged * nudged + (1.0 - USUAL.share_nudged) / self.room_m2)
-        rest = step - middle
-        free = self.dim * (len(rows) - 1)
-        return (
-            whole
-            - 0.5 * float((rest**2).sum()) / USUAL.turn_m**2
-            - 0.5 * free * math.log(2.0 * math.pi * USUAL.turn_m**2)
-        )
+        spread = np.zeros((len(rows), self.dim, self.dim))
+        for k, (row, landmark) in enumerate(zip(rows, self.known.landmark[rows], strict=True)):
+            a, b = (slice(self.dim * one, self.dim * one + self.dim) for one in (row, landmark))
+            spread[k] = self.known.covariance_m2[a, a] + self.own[b, b] + drift_m**2 * np.eye(self.dim)
+        was, now, far_m = self.known.position_m[rows], self.at[self.known.landmark[rows]], 1e5
+        near = log_evidence_of_motion(was, now, spread, USUAL.nudge_m)
+        density_m = (2.0 * math.pi) ** (0.5 * self.dim) * far_m**self.dim  # of a Gaussian so wide, at its middle
+        far = log_evidence_of_motion(was, now, spread, far_m) + math.log(density_m / self.room_m2)
+        both = np.logaddexp(math.log(USUAL.share_nudged) + near, math.log(1.0 - USUAL.share_nudged) + far)
+        self._of_moved[site, drift_m] = float(both)
+        return float(both)
 
 
 def _turn(angles: FloatArray) -> FloatArray:

@@ -11,17 +11,20 @@ exact coordinate ascent, one change at a time, from what most landmarks agree on
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotri
 
 from evermap.align.acceptance import TWO_PLACES, is_this_place, log_density_of, log_room
 from evermap.align.candidates import AGREE_M, Matches, are_apart, rank_motions
-from evermap.config import OverlayConfig
+from evermap.config import GroupingConfig, OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.group import PLANE, SPACE
 from evermap.geometry.rigid import rigid
+from evermap.maps.bodies import log_evidence_of_motion
 from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
@@ -29,6 +32,8 @@ ELSEWHERE = -1
 USUAL = OverlayConfig()
 MOST_FLIPS = 400
 """Steps of one ascent, at most: it ends long before."""
+ANYWHERE_M = 1e4
+"""Standard deviation of a move of which nothing is known, each axis: wider than any room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +118,7 @@ def lay_over(
     search: str = "joint",
     settings: OverlayConfig = USUAL,
     motion: FloatArray | None = None,
+    p_one_body: float = GroupingConfig().p_one_body,
 ) -> Overlay | None:
     """Return the most probable assignment of sites to cliques, and its motion.
 
@@ -124,6 +130,7 @@ def lay_over(
         settings: priors of what moved. Landmarks that nobody moved may be off by one of `drifts_m`: another robot with
             errors of its own, warmth, a sensor that sees another corner.
         motion: where the session lies about; None for where most landmarks agree, in the plane.
+        p_one_body: probability that the landmarks of a clique are on one body.
 
     Returns:
         None where no two landmarks stand to each other as in the map, or where another place explains all better. The
@@ -147,48 +154,100 @@ def lay_over(
         rivals = [
             other for other, some in ranked[1:] if matches.weight[some].sum() >= 0.5 * matches.weight[agree].sum()
         ]
-    options = _Options(sighted, known, motion, settings)
-    if search == "none":
-        chosen = options.likeliest_sites()
-    elif search == "gate":
-        chosen = options.gated(options.agreeing())
-    else:
-        chosen, score = _joint(options)
+    options = _Options(sighted, known, motion, settings, p_one_body)
+    if search != "joint":
+        chosen = options.likeliest_sites() if search == "none" else options.gated(options.agreeing())
+        return options.concluded(chosen) if options.n_standing(chosen) >= 2 else None
+    best = _search(options)
+    options, chosen = best.options, best.chosen
     if options.n_standing(chosen) < 2:
         return None
-    if search == "joint" and not (options.is_this_place(chosen) and options.outweighs_the_rest(chosen)):
+    if not (options.is_this_place(chosen) and options.outweighs_the_rest(chosen)):
         return None
-    found = options.concluded(chosen, split=search == "joint")
-    if search != "joint" or matches is None:
-        return found
-    for other in (_Options(sighted, known, rival, settings, options) for rival in rivals):
-        assignment, by_other = _joint(other)
-        if other.n_standing(assignment) < 2 or by_other <= score - settings.lead_nats:
+    found = options.concluded(chosen) if best.whole is None else best.mixed()
+    for other in (_search(_Options(sighted, known, rival, settings, p_one_body, options)) for rival in rivals):
+        if other.options.n_standing(other.chosen) < 2 or other.score <= best.score - settings.lead_nats:
             continue
-        rest = other.concluded(assignment, split=False)
-        if are_apart(rest.pose_map_session[None], found.pose_map_session, matches)[0]:
-            standing, count = (options.n_standing(chosen), other.n_standing(assignment)), len(np.unique(known.landmark))
-            return replace(found, reason=TWO_PLACES.format(*standing, count))
+        rest = other.options.concluded(other.chosen)
+        if matches is not None and are_apart(rest.pose_map_session[None], found.pose_map_session, matches)[0]:
+            standing = options.n_standing(chosen), other.options.n_standing(other.chosen)
+            return replace(found, reason=TWO_PLACES.format(*standing, len(np.unique(known.landmark))))
     return found
 
 
-def _joint(options: _Options) -> tuple[IntArray, float]:
-    """The most probable assignment, and with it how well sessions agree at all; and its log probability."""
+class _Found(NamedTuple):
+    """The most probable assignment (C,) of options, and its log probability.
+
+    Attributes:
+        whole: the same where no body was taken apart, and p_apart: (L,) probability that the body of each landmark is
+            none; None where none was.
+    """
+
+    options: _Options
+    chosen: IntArray
+    score: float
+    whole: tuple[Overlay, FloatArray] | None = None
+
+    def mixed(self) -> Overlay:
+        """Return the assignment, by whether bodies that were taken apart are bodies."""
+        assert self.whole is not None
+        found, (before, p_apart) = self.options.concluded(self.chosen), self.whole
+        same = np.where(before.place == found.place, before.probability, 1.0 - before.probability)
+        return replace(found, probability=p_apart * found.probability + (1.0 - p_apart) * same)
+
+
+def _search(options: _Options) -> _Found:
+    """Search for the most probable assignment, and take bodies apart whose members contradict each other.
+
+    What did not move with its body was grouped with it wrongly; as long as it is held to it, it bends what stands.
+    """
+    chosen, score, apart = _joint(options)
+    if not (apart > 0.0).any():
+        return _Found(options, chosen, score)
+    drift_m = options.drift_m
+    parted, again, by = options, chosen, score
+    for _ in range(2):  # at other drifts, and at the one that is found when these are apart
+        cliques = np.flatnonzero(apart > 0.0)
+        parted, start = options.parted(cliques, chosen)
+        again, by, _ = _joint(parted, start)
+        options.suppose(parted.drift_m)
+        apart = options.log_odds_apart(options.climb(chosen))
+        if np.array_equal(cliques, np.flatnonzero(apart > 0.0)):
+            break
+        if not (apart > 0.0).any():
+            by = -math.inf
+            break
+    if by <= score:
+        options.suppose(drift_m)
+        return _Found(options, chosen, score)
+    p_apart = 1.0 / (1.0 + np.exp(-np.maximum(apart, 0.0)))[options.sighted.clique]
+    p_apart[~np.isin(options.sighted.clique, cliques)] = 1.0  # the same landmarks in both
+    return _Found(parted, again, by, (options.concluded(options.climb(chosen)), p_apart))
+
+
+def _joint(options: _Options, start: IntArray | None = None) -> tuple[IntArray, float, FloatArray]:
+    """The most probable assignment, and with it how well sessions agree at all; its log probability; and (C,) log odds
+    that bodies are none, at most at any degree of agreement: what one landmark does alone looks as if none agreed well.
+    """
     settings = options.settings
-    best, highest, drift_m = options.agreeing(), -math.inf, settings.drifts_m[0]
     more = settings.drifts_in_space_m if options.dim == SPACE.point_dim else ()
-    for k, options.drift_m in enumerate((*settings.drifts_m, *more)):
+    drifts_m = (*settings.drifts_m, *more)
+    best, highest, drift_m = options.agreeing() if start is None else start, -math.inf, drifts_m[0]
+    apart = np.full(len(options.sites), -np.inf)
+    for k, wide_m in enumerate(drifts_m):
+        options.suppose(wide_m)
         chosen = options.climb(best)
         score = options.log_probability(chosen)
         # bodies that moved together agree, too, on a motion of their own: what stands may be the rest
         rest = options.climb(options.rest_of(chosen))
         if np.sum(rest != ELSEWHERE) >= 2 and (at := options.log_probability(rest)) > score:  # two tell the motion
             chosen, score = rest, at
+        apart = np.maximum(apart, options.log_odds_apart(chosen))
         score += k * math.log(settings.p_coarser)
         if score > highest:  # the next may still be better: with more drift other bodies stay
-            best, highest, drift_m = chosen, score, options.drift_m
-    options.drift_m = drift_m
-    return best, highest
+            best, highest, drift_m = chosen, score, wide_m
+    options.suppose(drift_m)
+    return best, highest, apart
 
 
 class _Field:
@@ -259,9 +318,11 @@ class _Options:
     """Cliques with their options, linearised at one motion; to be compared with others in the same room."""
 
     def __init__(
-        self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig, like: _Options | None = None
-    ) -> None:
+        self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig, p_one_body: float,
+        like: _Options | None = None,
+    ) -> None:  # fmt: skip
         self.n_places, self.n_sites = len(known.site), len(known.log_p_site)
+        self._given, self._p_one_body, self._log_parted = known, p_one_body, 0.0
         known = known.with_turned(sighted.clique, settings)
         self.settings = settings
         self.sighted, self.known, self.motion = sighted, known, motion
@@ -276,7 +337,6 @@ class _Options:
         free = np.repeat([settings.free_m, settings.free_rad], [group.point_dim, group.dim - group.point_dim])
         self._freedom = directions * free
         self._turned_m2 = np.where(np.arange(len(known.site)) < self.n_places, 0.0, settings.turned_m**2)
-        self.drift_m = settings.drifts_m[0]
         room = log_room(self.landmark_m, known.position_m, settings)
         self._log_room: float = room if like is None else like._log_room
         self._log_site = known.log_p_site + np.bincount(known.site, known.log_turned, len(known.log_p_site))
@@ -288,7 +348,69 @@ class _Options:
         self._gap_m = {site: float(gap[rows].max()) for site, rows in self._rows.items()}
         for site, rows in self._rows.items():
             self.sites[int(sighted.clique[known.landmark[rows[0]]])].append(site)
-        self._elsewhere = {site: self._log_elsewhere(rows) for site, rows in self._rows.items()}
+        self.suppose(settings.drifts_m[0])
+
+    def suppose(self, drift_m: float) -> None:
+        """Take unmoved landmarks to be off by a standard deviation from session to session."""
+        self.drift_m = drift_m
+        self._elsewhere: dict[int, float] = {}
+        for sites in self._by_size(self._rows):
+            rows = np.array([self._rows[site] for site in sites])
+            self._elsewhere |= zip(sites, self._log_elsewhere(rows).tolist(), strict=True)
+
+    def _by_size(self, sites: Iterable[int]) -> list[list[int]]:
+        """Return sites, those of as many places together."""
+        some: dict[int, list[int]] = {}
+        for site in sites:
+            some.setdefault(len(self._rows[site]), []).append(site)
+        return list(some.values())
+
+    def parted(self, cliques: IntArray, chosen: IntArray) -> tuple[_Options, IntArray]:
+        """Return the options with every member of some cliques by itself, and the assignment (C,) as one of these.
+
+        The first member of each keeps clique and sites; the others get new ones, as probable.
+        """
+        known, clique = self._given, self.sighted.clique.copy()
+        site, of_new, log_p_new, options = known.site.copy(), list[int](), list[float](), list(chosen)
+        for c in cliques.tolist():
+            for member in np.flatnonzero(self.sighted.clique == c)[1:].tolist():
+                clique[member] = len(known.log_p_elsewhere) + len(of_new)
+                of_new.append(c)
+                options.append(ELSEWHERE)
+                for row in np.flatnonzero(known.landmark == member).tolist():
+                    if int(chosen[c]) == known.site[row]:
+                        options[-1] = self.n_sites + len(log_p_new)
+                    site[row] = self.n_sites + len(log_p_new)
+                    log_p_new.append(float(known.log_p_site[known.site[row]]))
+        # options of being turned in place are numbered after the sites
+        options = [o + len(log_p_new) if o >= self.n_sites and k < len(chosen) else o for k, o in enumerate(options)]
+        single = replace(
+            known,
+            site=site,
+            log_p_site=np.append(known.log_p_site, log_p_new),
+            log_p_elsewhere=np.append(known.log_p_elsewhere, known.log_p_elsewhere[of_new]),
+        )
+        sighted = replace(self.sighted, clique=clique)
+        parted = _Options(sighted, single, self.motion, self.settings, self._p_one_body, self)
+        parted._log_parted = len(cliques) * math.log1p(-self._p_one_body)
+        options = [o if o in parted._rows else ELSEWHERE for o in options]  # of a turned one another number is its own
+        return parted, np.array(options, dtype=np.int64)
+
+    def log_odds_apart(self, chosen: IntArray) -> FloatArray:
+        """Return (C,) log odds that the landmarks of each clique are on bodies of their own, given the others."""
+        apart = np.full(len(self.sites), -np.inf)
+        scores, field = self._scores(chosen), self._field(chosen)
+        blocks = self._blocks(chosen)
+        for clique, sites in enumerate(self.sites):
+            for of in (self._rows[site] for site in sites if self._stands(site) and len(self._rows[site]) > 1):
+                out = np.tile(blocks[clique], (len(of), 1))
+                there = self._log_at(of[:, None], field, out) + self.known.log_turned[of]
+                there = there + self.known.log_p_site[self.known.site[of]]
+                moved = self._log_elsewhere(of[:, None]) + self.known.log_p_elsewhere[clique]
+                total = float(np.logaddexp(there, moved).sum()) + math.log1p(-self._p_one_body)
+                values = np.array(list(scores[clique].values()))
+                apart[clique] = max(apart[clique], total - float(np.logaddexp.reduce(values)))
+        return apart
 
     def likeliest_sites(self) -> IntArray:
         """Return (C,) for every clique its most probable site; `ELSEWHERE` where it is more probably away."""
@@ -315,14 +437,18 @@ class _Options:
         return np.asarray(np.where(chosen == ELSEWHERE, likely, ELSEWHERE))
 
     def climb(self, chosen: IntArray) -> IntArray:
-        """Climb from an assignment to one that no change of a single clique makes more probable."""
+        """Climb from an assignment to one that no change of a single clique makes more probable.
+
+        Two landmarks stay where they stand: of fewer no motion follows, and without one nothing has moved by little.
+        """
         chosen = chosen.copy()
         seen = {chosen.tobytes()}
         for _ in range(MOST_FLIPS):
             flips = []
             for c, scores in enumerate(self._scores(chosen)):
                 best = max(scores, key=lambda o: scores[o])
-                if (gain := scores[best] - scores[int(chosen[c])]) > 1e-9:
+                gain = scores[best] - scores[int(chosen[c])]
+                if gain > 1e-9 and (self._stands(best) or self._is_alignment(chosen, without=c)):
                     flips.append((gain, c, best))
             if not flips:
                 break
@@ -396,15 +522,15 @@ class _Options:
             if sites:
                 site = int(chosen[clique])
                 total += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self._log_site[site])
-        return total, len(rows)
+        return total + self._log_parted, len(rows)
 
     def n_standing(self, chosen: IntArray) -> int:
         """Return landmarks that are at their places in the map."""
         rows = self._chosen_rows(chosen)
         return len(np.unique(self.known.landmark[rows[rows < self.n_places]]))
 
-    def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
-        """Return the assignment by landmark, with bodies split whose members disagree."""
+    def concluded(self, chosen: IntArray) -> Overlay:
+        """Return the assignment by landmark."""
         table = self._scores(chosen)
         place = np.full(len(self.landmark_m), ELSEWHERE, dtype=np.int64)
         probability = np.zeros(len(place))
@@ -420,8 +546,6 @@ class _Options:
                 probability[mine] = share[list(scores).index(best)]
                 continue
             probability[mine] = share[moved].sum()
-            if split and len(mine) > 1:
-                self._split(clique, chosen, scores[ELSEWHERE], place)
         rows = self._chosen_rows(chosen)
         rows = rows[rows < self.n_places]
         matched = self.known.landmark[rows]
@@ -430,21 +554,10 @@ class _Options:
             motion = rigid(self.sighted.position_m[matched], self.known.position_m[rows])
         return Overlay(motion, place, probability, self.drift_m)
 
-    def _split(self, clique: int, chosen: IntArray, together: float, place: IntArray) -> None:
-        """Return members that have not moved, while the body as a whole has."""
-        field = self._field(chosen)
-        for site in filter(self._stands, self.sites[clique]):
-            rows = self._rows[site]
-            moved = np.array([self._log_elsewhere(np.array([row])) for row in rows])
-            nothing = np.zeros((len(rows), 0), dtype=np.int64)
-            at_place = self._log_at(rows[:, None], field, nothing) + self.known.log_turned[rows]
-            stay = at_place > moved
-            total = math.log(self.settings.p_split) + float(self.known.log_p_elsewhere[clique])
-            total += float(np.maximum(at_place, moved).sum())
-            if stay.any() and total > together:
-                kept = rows[stay]
-                place[self.known.landmark[kept]] = kept
-                return
+    def _is_alignment(self, chosen: IntArray, without: int) -> bool:
+        """Return whether two landmarks stand, or no more than do now, without those of one clique."""
+        standing = [len(self._rows[int(o)]) if self._stands(o) else 0 for o in chosen]
+        return not standing[without] or sum(standing) - standing[without] >= 2
 
     def _chosen_rows(self, chosen: IntArray) -> IntArray:
         parts = [self._rows[int(site)] for site in chosen if site != ELSEWHERE]
@@ -456,13 +569,12 @@ class _Options:
 
     def _scores(self, chosen: IntArray) -> list[dict[int, float]]:
         """Return the log probability of the options of every clique, given the choices for the others."""
-        field, at = self._field(chosen), 0
+        field, blocks = self._field(chosen), self._blocks(chosen)
         asked: dict[tuple[int, int], list[tuple[int, IntArray]]] = {}
         there: dict[int, list[tuple[int, IntArray]]] = {}
         for clique, sites in enumerate(self.sites):
-            block = np.zeros(0, dtype=np.int64)
-            if (mine := int(chosen[clique])) != ELSEWHERE:
-                block = np.arange(at, at := at + self.dim * len(self._rows[mine]))
+            mine, block = int(chosen[clique]), blocks[clique]
+            if mine != ELSEWHERE:
                 there.setdefault(len(block), []).append((mine, block))
             for site in sites:
                 if site != mine:
@@ -482,6 +594,11 @@ class _Options:
             table.append({ELSEWHERE: float(self.known.log_p_elsewhere[clique]) + moved, **scores})
         return table
 
+    def _blocks(self, chosen: IntArray) -> list[IntArray]:
+        """Return the rows of every clique's own differences among those of all that are chosen."""
+        size = [0 if site == ELSEWHERE else self.dim * len(self._rows[int(site)]) for site in chosen]
+        return np.split(np.arange(sum(size)), np.cumsum(size)[:-1])
+
     def _log_at(self, of: IntArray, field: _Field, out: IntArray) -> FloatArray:
         """(K,) log densities of places (K, M), being where their landmarks are, by all that are chosen but some."""
         shape, landmark = of.shape, self.known.landmark[of]
@@ -492,18 +609,17 @@ class _Options:
         error = (self.landmark_m[landmark] - self.known.position_m[of]).reshape(rows.shape)
         return field.log_at(rows, error, covariance, self._freedom[session], out)
 
-    def _log_elsewhere(self, of: IntArray) -> float:
-        """Log density of the landmarks of places `of`, if their body was moved."""
-        step = self.landmark_m[self.known.landmark[of]] - self.known.position_m[of]
-        middle = step.mean(axis=0)
-        share, nudge_m, turn_m = float(self.settings.share_nudged), self.settings.nudge_m, self.settings.turn_m
-        log_volume = 0.5 * self.dim * math.log(2.0 * math.pi * nudge_m**2)
-        near = math.log(share) - log_volume - 0.5 * float(middle @ middle) / nudge_m**2
-        log_density = float(np.logaddexp(near, math.log(1.0 - share) - self._log_room))
-        rest = step - middle
-        count = self.dim * (len(of) - 1)
-        still = 0.5 * float((rest**2).sum()) / turn_m**2 + 0.5 * count * math.log(2 * math.pi * turn_m**2)
-        return float(log_density - still)
+    def _log_elsewhere(self, of: IntArray) -> FloatArray:
+        """(K,) log densities of the landmarks of places (K, M), if one rigid motion moved each body (`maps.bodies`)."""
+        landmark, dim = self.known.landmark[of], self.dim
+        rows, session = (se2.xy_rows(some.ravel(), dim).reshape(-1, dim) for some in (of, landmark))
+        spread = _square(self._session, session) + _square(self.known.covariance_m2, rows)
+        spread = (spread + self.drift_m**2 * np.eye(dim)).reshape(*of.shape, dim, dim)
+        was, now, share = self.known.position_m[of], self.landmark_m[landmark], float(self.settings.share_nudged)
+        near = log_evidence_of_motion(was, now, spread, self.settings.nudge_m)
+        far = log_evidence_of_motion(was, now, spread, ANYWHERE_M)
+        far = far + 0.5 * dim * math.log(2.0 * math.pi * ANYWHERE_M**2) - self._log_room
+        return np.asarray(np.logaddexp(math.log(share) + near, math.log(1.0 - share) + far))
 
     def _field(self, chosen: IntArray) -> _Field:
         """What all places that are chosen say of the others."""

@@ -181,6 +181,7 @@ def laid_over(
         config.search,
         config.overlay,
         None if turned is None else turned.pose_map_session,
+        config.grouping.p_one_body,
     )
     if found is None:
         return None
