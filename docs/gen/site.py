@@ -147,23 +147,31 @@ def _first_line(value: Any) -> str:
 
 
 def configuration_page() -> str:
-    """Return the page of all configuration keys: default, bounds and meaning."""
+    """Return the page of all configuration keys, and of the rules beside them: default, bounds and meaning."""
     from evermap.config import Config
+    from evermap.config.section import is_rule
 
     lines = [
         "# Configuration",
         "",
         "Every key with its default, its bounds and its meaning. Keys are set in a TOML file (`--config`) or one by",
-        "one (`--set slam.seed=3`); `evermap slam --show-config` prints them as a file to start from.",
+        "one (`--set slam.seed=3`); `evermap slam --show-config` prints them as a file to start from. Rules are",
+        "numbers of the method, which come with evermap; an experiment in Python may change them",
+        "(`evermap.config.with_rules`).",
         "",
     ]
     for section, model in _sections(Config, ()):
-        rows = [row for name, field in model.model_fields.items() if (row := _key(name, field))]
-        if not rows:
+        fields = model.model_fields.items()
+        rows, rules = (
+            [row for name, field in fields if is_rule(field) == of_rules and (row := _key(name, field))]
+            for of_rules in (False, True)
+        )
+        if not rows and not rules:
             continue
-        title = ".".join(section) or "top"
-        lines += [f"## {title}", "", _first_line(model), "", "| key | default | bounds | meaning |"]
-        lines += ["| --- | --- | --- | --- |", *rows, ""]
+        lines += [f"## {'.'.join(section) or 'top'}", "", _first_line(model), ""]
+        for of, table in (("key", rows), ("rule", rules)):
+            if table:
+                lines += [f"| {of} | default | bounds | meaning |", "| --- | --- | --- | --- |", *table, ""]
     return "\n".join(lines)
 
 

@@ -14,7 +14,17 @@ from typer.testing import CliRunner
 
 import evermap
 from evermap.cli.main import app
-from evermap.config import Config, Section, SensorConfig, load_config, to_toml, with_overrides
+from evermap.config import (
+    Config,
+    Section,
+    SensorConfig,
+    load_config,
+    parse_config,
+    to_toml,
+    with_overrides,
+    with_rules,
+)
+from evermap.config.section import find_rule
 from evermap.errors import ConfigError
 from evermap.slam.calibration import NAMES, CalibrationPrior
 from evermap.types import Sensor
@@ -62,9 +72,54 @@ def test_every_key_is_set_by_its_name_and_written_as_it_is(name: str) -> None:
         for part in path:
             of_run = of_run[part]
         assert of_run[last] == json.loads(json.dumps(value))
+        if find_rule(Config, key.split(".")):
+            assert with_rules(config, {key: value}) == config
+            continue
         assert f"{last} =" in shown
         if value is not None and not isinstance(value, dict):
             assert with_overrides(config, [f"{key}={json.dumps(value)}"]) == config
+
+
+def test_keys_are_what_a_user_sets_with_sense_and_fit_on_three_screens() -> None:
+    names = [name for name, _ in leaves(Config())]
+    assert sum(not find_rule(Config, name.split(".")) for name in names) <= 150
+    shown = to_toml(Config()).splitlines()
+    assert len(shown) <= 3 * 75
+    assert [line for line in shown if " = " in line and "  # " not in line] == []
+    assert "[slam.votes]" not in shown, "a section of rules alone"
+    assert "[slam.explain]" in shown
+
+
+@pytest.mark.parametrize(
+    ("content", "override", "named"),
+    [
+        ("[living.looks]\nsticky = 3.0", "living.looks.sticky=3", "living.looks.sticky"),
+        ("[slam]\nnarrowing = 'no'", "slam.narrowing=no", "slam.narrowing"),
+        ("[slam.votes]\ngate = 1.0", "slam.votes.gate=1", "slam.votes"),
+        ("[slam]\nvotes = {}", "slam.votes={}", "slam.votes"),
+    ],
+)
+def test_rules_of_the_method_are_no_keys(content: str, override: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "my.toml"
+    path.write_text(content, encoding="utf-8")
+    for attempt in (lambda: load_config(path), lambda: load_config(None, [override])):
+        with pytest.raises(ConfigError, match="is no key that can be set") as caught:
+            attempt()
+        assert named in str(caught.value)
+        assert "--show-config lists the keys" in str(caught.value)
+
+
+def test_an_experiment_may_change_rules_and_maps_keep_what_it_changed() -> None:
+    config = with_rules(Config(), {"living.looks.sticky": 3.0, "slam.seed": 5})
+    assert (config.living.looks.sticky, config.slam.seed) == (3.0, 5)
+    written = to_toml(config)
+    assert "sticky = 3.0" in written
+    assert "witnesses" not in written, "a rule as it comes"
+    assert parse_config(written) == config
+    with pytest.raises(ConfigError, match=r"living\.looks\.sticky"):
+        with_rules(Config(), {"living.looks.sticky": 0.0})
+    with pytest.raises(ConfigError, match="unknown key"):
+        with_rules(Config(), {"living.looks.stiky": 3.0})
 
 
 def test_every_key_is_read_by_the_code() -> None:
@@ -78,21 +133,22 @@ def test_every_key_is_read_by_the_code() -> None:
 
 
 @pytest.mark.parametrize(
-    "override",
+    ("name", "value"),
     [
-        "slam.calibration.sigma.range_slop=0.1",
-        "slam.calibration.kinds.sonar=[1, 1, 1, 1, 1]",
-        "slam.changes.most_groups=0",
-        "slam.votes.gate=0",
-        "slam.space.map.p_moved=1",
-        "living.boxes.found_pairs=1",
-        "track.shape.misplaced=0.5",
-        "live.beliefs_s=0",
+        ("slam.calibration.sigma.range_slop", 0.1),
+        ("slam.calibration.kinds.sonar", [1, 1, 1, 1, 1]),
+        ("slam.changes.most_groups", 0),
+        ("slam.votes.gate", 0),
+        ("slam.space.map.p_moved", 1),
+        ("living.boxes.found_pairs", 1),
+        ("track.shape.misplaced", 0.5),
+        ("live.beliefs_s", 0),
     ],
 )
-def test_values_out_of_bounds_are_refused(override: str) -> None:
-    with pytest.raises(ConfigError):
-        load_config(None, [override])
+def test_values_out_of_bounds_are_refused(name: str, value: object) -> None:
+    for attempt in (with_rules, lambda config, values: load_config(None, values=values)):
+        with pytest.raises(ConfigError):
+            attempt(Config(), {name: value})
 
 
 def test_priors_of_calibration_are_set_one_by_one() -> None:

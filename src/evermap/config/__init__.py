@@ -39,6 +39,7 @@ from evermap.config.section import (
     config_error,
     key,
     part,
+    rule,
 )
 from evermap.config.sensor import (
     KINDS,
@@ -78,6 +79,7 @@ from evermap.config.whole import (
     refuse_unread,
     to_toml,
     with_overrides,
+    with_rules,
 )
 
 __all__ = [
@@ -149,6 +151,8 @@ __all__ = [
     "parse_config",
     "part",
     "refuse_unread",
+    "rule",
     "to_toml",
     "with_overrides",
+    "with_rules",
 ]

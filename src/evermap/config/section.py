@@ -1,12 +1,17 @@
-"""A section of the configuration: keys with defaults, bounds and meanings, and what is said of a wrong one."""
+"""A section of the configuration: keys with defaults, bounds and meanings, and what is said of a wrong one.
+
+A section also holds rules: numbers of the method beside the keys they belong to. They are of the code, not of a
+recording or a site, so a file or `--set` cannot change them; an experiment in Python can (`with_rules`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypeGuard, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from evermap.errors import ConfigError, similar, suggestion
 
@@ -29,6 +34,16 @@ def key(default: Any, meaning: str, **bounds: Any) -> Any:
     A default that can be changed is copied for every section.
     """
     return Field(default=default, description=meaning, **bounds)
+
+
+def rule(default: Any, meaning: str, **bounds: Any) -> Any:
+    """Define a rule of a section: a number of the method, with its meaning as of `key`, which no user sets."""
+    return Field(default=default, description=meaning, json_schema_extra={"rule": True}, **bounds)
+
+
+def is_rule(info: FieldInfo) -> bool:
+    """Return whether a field is a rule, not a key."""
+    return isinstance(info.json_schema_extra, dict) and bool(info.json_schema_extra.get("rule"))
 
 
 def part(section: Callable[[], Section], meaning: str) -> Any:
@@ -91,11 +106,30 @@ def _words_of(annotation: Any) -> list[str]:
 
 
 def list_keys(section: type[Section], prefix: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the dotted names of all fields and of the sections that hold them."""
+    """Yield the dotted names of all keys, and of the sections that hold some."""
     for name, info in section.model_fields.items():
-        yield ".".join((*prefix, name))
-        if isinstance(info.annotation, type) and issubclass(info.annotation, Section):
-            yield from list_keys(info.annotation, (*prefix, name))
+        if is_rule(info):
+            continue
+        inner = list(list_keys(info.annotation, (*prefix, name))) if _is_section(info.annotation) else None
+        if inner is None or inner:
+            yield ".".join((*prefix, name))
+            yield from inner or ()
+
+
+def find_rule(section: type[Section], names: Sequence[str]) -> bool:
+    """Return whether a dotted name is that of a rule, or of a section that holds nothing else."""
+    for depth, name in enumerate(names):
+        info = section.model_fields.get(name)
+        if info is None:
+            return False
+        if not _is_section(info.annotation):
+            return is_rule(info) and depth == len(names) - 1
+        section = info.annotation
+    return not list(list_keys(section))
+
+
+def _is_section(annotation: Any) -> TypeGuard[type[Section]]:
+    return isinstance(annotation, type) and issubclass(annotation, Section)
 
 
 def _nearest_key(root: type[Section], names: list[str], value: Any) -> str:

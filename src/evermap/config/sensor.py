@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import ValidationInfo, field_validator
 
-from evermap.config.section import NotNegative, Positive, Probability, Section, Share, key
+from evermap.config.section import NotNegative, Positive, Probability, Section, Share, key, rule
 from evermap.errors import ConfigError
 from evermap.types import NOT_IN_SPACE, Sensor, SensorKind, SpatialSensor
 
@@ -54,13 +54,13 @@ class CalibrationConfig(Section):
         KINDS, "those of the first five, which depend on the kind of sensor, where it is stated"
     )
     sigma_askew_rad: Positive = key(0.03, "of the direction in which a robot drives, from its front, if unstated [rad]")
-    p_needed: Share = key(0.5, "prior probability that a state is not as stated")
-    p_needed_sensor: Share = key(0.1, "the same of errors of ranges, for a laser or a sensor of no stated kind")
-    p_needed_known: Share = key(0.9, "the same of a sensor that is stated to be of another kind than a laser")
-    p_needed_mount: Share = key(
+    p_needed: Share = rule(0.5, "prior probability that a state is not as stated")
+    p_needed_sensor: Share = rule(0.1, "the same of errors of ranges, for a laser or a sensor of no stated kind")
+    p_needed_known: Share = rule(0.9, "the same of a sensor that is stated to be of another kind than a laser")
+    p_needed_mount: Share = rule(
         0.1, "the same of each coordinate of the mount, which one measures, if it has no data sheet"
     )
-    p_spare: Share = key(0.01, "probability to be needed below which a state is held as stated")
+    p_spare: Share = rule(0.01, "probability to be needed below which a state is held as stated")
 
     @field_validator("sigma", "kinds")
     @classmethod
@@ -75,11 +75,11 @@ class OdometryConfig(Section):
     """What is believed of the odometry, beside its noise."""
 
     silence_s: Positive = key(1.0, "gap of the odometry beyond which the last velocity is not continued [s]")
-    silent_variance: Positive = key(0.25, "variance that such a silence adds every second, at least [m^2/s, rad^2/s]")
-    longest_silence_s: Positive = key(60.0, "after a longer silence no more is unknown than after this [s]")
-    turn_s: Positive = key(2.0, "span over which turns stand out from jitter [s]")
-    stands_out: Positive = key(3.0, "standard deviations of the jitter by which it does")
-    loose_rad: Positive = key(0.3, "heading that a silence leaves unknown, from which a recording is in parts [rad]")
+    silent_variance: Positive = rule(0.25, "variance that such a silence adds every second, at least [m^2/s, rad^2/s]")
+    longest_silence_s: Positive = rule(60.0, "after a longer silence no more is unknown than after this [s]")
+    turn_s: Positive = rule(2.0, "span over which turns stand out from jitter [s]")
+    stands_out: Positive = rule(3.0, "standard deviations of the jitter by which it does")
+    loose_rad: Positive = rule(0.3, "heading that a silence leaves unknown, from which a recording is in parts [rad]")
 
 
 class SensorConfig(Section):

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from evermap.config.association import AssociationConfig
-from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share, key, part
+from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share, key, part, rule
 from evermap.config.sensor import CalibrationConfig, OdometryConfig
 from evermap.config.space import SpaceConfig
 from evermap.types import FloatArray
@@ -17,38 +17,40 @@ from evermap.types import FloatArray
 class VotesConfig(Section):
     """Identities that were read wrongly, by other detections of the seconds around."""
 
-    window_s: Positive = key(5.0, "before and after a detection, the odometry hardly drifts [s]")
-    sigma_m: Positive = key(0.05, "error of a detection's place at no distance [m] ...")
-    sigma_share: NotNegative = key(0.05, "... and as a share of its range")
-    gate: Positive = key(2.0, "standard deviations within which another detection is of the same place")
-    fewest: Count = key(2, "detections with another id that contradict one, at least ...")
-    times: NotNegative = key(3.0, "... and more than so many times those with its own")
-    fewest_doubles: Count = key(3, "frames that have an id at two places, from which on it is on two landmarks")
-    surprising: Positive = key(50.0, "squared normalised residual from which a sighting disputes where its landmark is")
+    window_s: Positive = rule(5.0, "before and after a detection, the odometry hardly drifts [s]")
+    sigma_m: Positive = rule(0.05, "error of a detection's place at no distance [m] ...")
+    sigma_share: NotNegative = rule(0.05, "... and as a share of its range")
+    gate: Positive = rule(2.0, "standard deviations within which another detection is of the same place")
+    fewest: Count = rule(2, "detections with another id that contradict one, at least ...")
+    times: NotNegative = rule(3.0, "... and more than so many times those with its own")
+    fewest_doubles: Count = rule(3, "frames that have an id at two places, from which on it is on two landmarks")
+    surprising: Positive = rule(
+        50.0, "squared normalised residual from which a sighting disputes where its landmark is"
+    )
 
 
 class RangesConfig(Section):
     """Detections without a bearing: where their landmarks are, before the estimator begins."""
 
-    window_s: Positive = key(20.0, "span of ranges that locate a landmark, or the double, and so on [s]")
-    drift_share: NotNegative = key(0.03, "drift of the odometry over it, as a share of the way")
-    fewest: Count = key(6, "ranges that this takes")
-    most_ranges: Count = key(200, "ranges that are used, at most")
-    starts: int = key(16, "directions from which the place is sought", ge=4)
-    steps: Count = key(30, "steps from each")
-    tail: Positive = key(2.0, "standard deviations beyond which a range is probably an outlier")
-    most_sigma_m: Positive = key(1.0, "standard deviation from which a place is not known [m]")
-    apart_m: Positive = key(1.0, "distance from which another place is another one [m] ...")
-    rival_nats: NotNegative = key(6.0, "... and how much worse it must be [nats]")
-    first_m: Positive = key(1.0, "least standard deviation of the place at which the estimator begins [m]")
+    window_s: Positive = rule(20.0, "span of ranges that locate a landmark, or the double, and so on [s]")
+    drift_share: NotNegative = rule(0.03, "drift of the odometry over it, as a share of the way")
+    fewest: Count = rule(6, "ranges that this takes")
+    most_ranges: Count = rule(200, "ranges that are used, at most")
+    starts: int = rule(16, "directions from which the place is sought", ge=4)
+    steps: Count = rule(30, "steps from each")
+    tail: Positive = rule(2.0, "standard deviations beyond which a range is probably an outlier")
+    most_sigma_m: Positive = rule(1.0, "standard deviation from which a place is not known [m]")
+    apart_m: Positive = rule(1.0, "distance from which another place is another one [m] ...")
+    rival_nats: NotNegative = rule(6.0, "... and how much worse it must be [nats]")
+    first_m: Positive = rule(1.0, "least standard deviation of the place at which the estimator begins [m]")
 
 
 class RoomConfig(Section):
     """What tells that landmarks lie over a map from landmarks of another place, where each stands anywhere."""
 
-    p_another_place: Share = key(1e-3, "probability that a session is from another place")
-    smallest_room_m2: Positive = key(50.0, "minimum area in which moved landmarks may be found [m^2]")
-    lowest_room_m: Positive = key(1.0, "height of a room in space, at least [m]")
+    p_another_place: Share = rule(1e-3, "probability that a session is from another place")
+    smallest_room_m2: Positive = rule(50.0, "minimum area in which moved landmarks may be found [m^2]")
+    lowest_room_m: Positive = rule(1.0, "height of a room in space, at least [m]")
     lead_nats: NotNegative = key(
         3.0, "log odds of an alignment over the next best one, from which it is accepted [nats]"
     )
@@ -58,27 +60,27 @@ class LocalizeConfig(RoomConfig):
     """When the place of a robot in a map is known, and when it is lost; landmarks are found by their identity."""
 
     fewest: Count = key(3, "landmarks that must have the relative positions of the map")
-    p_stands: Share = key(0.9, "probability that a landmark is where the map has it, at most: groups move together")
+    p_stands: Share = rule(0.9, "probability that a landmark is where the map has it, at most: groups move together")
     certain_nats: NotNegative = key(
         6.0, "log odds of an alignment over another place, from which it is accepted [nats]"
     )
-    enough: Count = key(5, "landmarks of the map that a live session has met when it is entered")
+    enough: Count = rule(5, "landmarks of the map that a live session has met when it is entered")
     alone_s: NotNegative = key(10.0, "where no third landmark comes into view for so long, two are enough [s]")
-    spread_m: Positive = key(1.0, "how far apart they must be, for a recording that is smoothed afterwards [m]")
-    spread_online_m: Positive = key(
+    spread_m: Positive = rule(1.0, "how far apart they must be, for a recording that is smoothed afterwards [m]")
+    spread_online_m: Positive = rule(
         2.0, "the same for a robot that is followed in the map: farther than on one body [m]"
     )
-    track_s: Positive = key(30.0, "age of sightings that odometry still ties to the newest [s]")
-    least_belief: Share = key(0.05, "least probability that a landmark is at its known place, if it is seen there")
-    believed: Share = key(0.5, "belief from which not to be seen is a miss")
-    sure_m: Positive = key(0.5, "no landmark is expected while the position is less certain than this [m]")
-    least_p_detect: Share = key(0.01, "P(detect) from which a landmark is expected in view")
-    doubt: Positive = key(1.0, "by which a place is doubted for each frame that has its landmark elsewhere [nats] ...")
-    most_doubt: Positive = key(9.0, "... and by which in all, at most [nats]")
-    remembered: Count = key(8, "landmarks, compared last, that judge whether the robot is lost")
-    least_remembered: Count = key(3, "the same, at least")
-    memory_s: Positive = key(20.0, "age up to which they do [s]")
-    better_by: float = key(1.5, "times that another pose must fit better than this one", ge=1.0)
+    track_s: Positive = rule(30.0, "age of sightings that odometry still ties to the newest [s]")
+    least_belief: Share = rule(0.05, "least probability that a landmark is at its known place, if it is seen there")
+    believed: Share = rule(0.5, "belief from which not to be seen is a miss")
+    sure_m: Positive = rule(0.5, "no landmark is expected while the position is less certain than this [m]")
+    least_p_detect: Share = rule(0.01, "P(detect) from which a landmark is expected in view")
+    doubt: Positive = rule(1.0, "by which a place is doubted for each frame that has its landmark elsewhere [nats] ...")
+    most_doubt: Positive = rule(9.0, "... and by which in all, at most [nats]")
+    remembered: Count = rule(8, "landmarks, compared last, that judge whether the robot is lost")
+    least_remembered: Count = rule(3, "the same, at least")
+    memory_s: Positive = rule(20.0, "age up to which they do [s]")
+    better_by: float = rule(1.5, "times that another pose must fit better than this one", ge=1.0)
 
 
 class ModesConfig(Section):
@@ -96,7 +98,7 @@ class ModesConfig(Section):
     lifetime: str | None = key(
         None, "prior of how long a mode lasts, e.g. 'exponential:half-life=30d'; unset: constant"
     )
-    rounds: int = key(10, "maximum rounds of selecting modes and relinearising", ge=1, le=100)
+    rounds: int = rule(10, "maximum rounds of selecting modes and relinearising", ge=1, le=100)
     mcts_budget: int = key(200, "iterations of the tree search for every decision", ge=1)
     mcts_window_s: Positive | None = key(40.0, "window of the tree search [s]; unset: from the start")
 
@@ -106,28 +108,30 @@ class ChangesConfig(Section):
 
     p_moved: float = key(0.01, "prior probability that anything moved at all", gt=0, lt=1)
     move_sigma_m: Positive = key(0.7, "standard deviation of a displacement, each axis [m]")
-    p_rotated: Probability = key(0.1, "share of moves with a rotation")
-    turn_sigma_rad: Positive = key(0.5, "standard deviation of such a rotation [rad]")
-    rigid_m: Positive = key(0.005, "members of a group keep their distances to within this [m]")
-    p_swapped: Share = key(1e-5, "probability that any two landmarks of a map were mixed up")
-    displaced_log_odds: float = key(
+    p_rotated: Probability = rule(0.1, "share of moves with a rotation")
+    turn_sigma_rad: Positive = rule(0.5, "standard deviation of such a rotation [rad]")
+    rigid_m: Positive = rule(0.005, "members of a group keep their distances to within this [m]")
+    p_swapped: Share = rule(1e-5, "probability that any two landmarks of a map were mixed up")
+    displaced_log_odds: float = rule(
         7.0, "prior log odds against a temporary displacement of a landmark [nats]", gt=0, le=50
     )
-    map_factor_spread: Positive = key(0.35, "standard deviation of the logarithm of a factor on the sigmas of a map")
-    softness_m: tuple[Positive, ...] = key(
+    map_factor_spread: Positive = rule(0.35, "standard deviation of the logarithm of a factor on the sigmas of a map")
+    softness_m: tuple[Positive, ...] = rule(
         (0.005, 0.01, 0.02, 0.04),
         "candidate common errors of the sightings of a landmark in a part of the session; chosen by evidence [m]",
         min_length=1,
     )
-    usual_softness_m: Positive = key(0.02, "the same during the search for swaps and temporary displacements [m]")
+    usual_softness_m: Positive = rule(0.02, "the same during the search for swaps and temporary displacements [m]")
     most_groups: Count = key(4, "maximum number of moved groups")
-    most_candidates: Count = key(40, "maximum number of candidates for moves, the likeliest")
-    visit_gap_s: Positive = key(10.0, "gap between sightings after which a new visit begins [s]")
-    interval: Share = key(0.95, "probability of the reported interval of a change")
-    rival_nats: NotNegative = key(5.0, "maximum distance of a reported alternative from the best explanation [nats]")
-    most_rivals: int = key(2, "maximum number of reported alternatives", ge=0)
-    disagreement: Positive = key(4.0, "chi-square per degree of freedom above which a map without changes does not fit")
-    loose_map_m: Positive = key(1.0, "standard deviation of a map that must not distort the session [m]")
+    most_candidates: Count = rule(40, "maximum number of candidates for moves, the likeliest")
+    visit_gap_s: Positive = rule(10.0, "gap between sightings after which a new visit begins [s]")
+    interval: Share = rule(0.95, "probability of the reported interval of a change")
+    rival_nats: NotNegative = rule(5.0, "maximum distance of a reported alternative from the best explanation [nats]")
+    most_rivals: int = rule(2, "maximum number of reported alternatives", ge=0)
+    disagreement: Positive = rule(
+        4.0, "chi-square per degree of freedom above which a map without changes does not fit"
+    )
+    loose_map_m: Positive = rule(1.0, "standard deviation of a map that must not distort the session [m]")
 
     @property
     def spread(self) -> FloatArray:
@@ -138,20 +142,20 @@ class ChangesConfig(Section):
 class CheckConfig(Section):
     """What makes a recording odd; see `slam.check`."""
 
-    lags_s: tuple[Positive, ...] = key(
+    lags_s: tuple[Positive, ...] = rule(
         (1.0, 4.0), "minimum time between compared sightings; the maximum is twice as long [s]", min_length=1
     )
-    most_pairs: Count = key(1000, "pairs of sightings compared for each lag, at most")
-    fits: Positive = key(0.03, "usual difference between two readings: share of the range, and rad")
-    apart: Positive = key(3.0, "difference in median residuals by which a pair distinguishes two explanations")
-    agreed: Share = key(0.8, "share of those pairs that a mistake must explain to be reported")
-    fewest: Count = key(20, "minimum number of such pairs")
-    gain: Positive = key(20.0, "minimum gain in log likelihood of a mistake over all pairs")
-    off: Positive = key(0.3, "median residual above which readings and odometry are unrelated")
-    own_ids: Count = key(
+    most_pairs: Count = rule(1000, "pairs of sightings compared for each lag, at most")
+    fits: Positive = rule(0.03, "usual difference between two readings: share of the range, and rad")
+    apart: Positive = rule(3.0, "difference in median residuals by which a pair distinguishes two explanations")
+    agreed: Share = rule(0.8, "share of those pairs that a mistake must explain to be reported")
+    fewest: Count = rule(20, "minimum number of such pairs")
+    gain: Positive = rule(20.0, "minimum gain in log likelihood of a mistake over all pairs")
+    off: Positive = rule(0.3, "median residual above which readings and odometry are unrelated")
+    own_ids: Count = rule(
         50, "number of landmarks above which hardly any second sighting indicates that ids name detections"
     )
-    far_off: Positive = key(5.0, "standard deviations of its prior beyond which a calibration state is reported")
+    far_off: Positive = rule(5.0, "standard deviations of its prior beyond which a calibration state is reported")
 
 
 class CleaningConfig(Section):
@@ -159,16 +163,16 @@ class CleaningConfig(Section):
 
     fastest: Positive = key(100.0, "speed above which odometry is dropped [m/s, rad/s]")
     hardest: Positive = key(20.0, "acceleration above which odometry is a spike [m/s^2, rad/s^2]")
-    sharpest: Positive = key(2.0, "change of speed that is never a spike [m/s, rad/s]")
-    too_far: float = key(2.0, "factor on the maximum range above which a reading is dropped", ge=1.0)
-    far_from_median: float = key(100.0, "the same on the median range, for a sensor without a maximum range", ge=1.0)
-    ranges_only: Share = key(0.2, "share of readings without a bearing above which a sensor measures ranges only")
-    moved: Positive = key(0.1, "motion after which identical readings indicate stale data [m, rad]")
+    sharpest: Positive = rule(2.0, "change of speed that is never a spike [m/s, rad/s]")
+    too_far: float = rule(2.0, "factor on the maximum range above which a reading is dropped", ge=1.0)
+    far_from_median: float = rule(100.0, "the same on the median range, for a sensor without a maximum range", ge=1.0)
+    ranges_only: Share = rule(0.2, "share of readings without a bearing above which a sensor measures ranges only")
+    moved: Positive = rule(0.1, "motion after which identical readings indicate stale data [m, rad]")
     stray_s: Positive = key(
         10.0, "distance from neighbouring stamps, and of frames from odometry, above which they are dropped [s]"
     )
-    step_s: Positive = key(1.0, "smallest step of a clock that is repaired [s]")
-    around: int = key(9, "messages that a stamp is compared with; an odd number", ge=3, le=999)
+    step_s: Positive = rule(1.0, "smallest step of a clock that is repaired [s]")
+    around: int = rule(9, "messages that a stamp is compared with; an odd number", ge=3, le=999)
 
     @field_validator("around")
     @classmethod
@@ -182,16 +186,18 @@ class ExplainConfig(Section):
     """Causes other than changes of landmarks: when they are asked, and what they must gain."""
 
     on: bool = key(True, "ask for causes where a session contradicts what was stated")
-    rejected: Share = key(0.08, "share of rejected detections from which causes are asked")
-    innovations: Positive = key(1.35, "mean squared normalised innovation, a number, from which causes are asked")
-    states: Positive = key(4.0, "standard deviations of a calibration state from its prior from which causes are asked")
-    noise: Positive = key(3.0, "factor of a noise level on what is stated from which causes are asked")
-    late_s: Positive = key(0.1, "delay of a clock from which it is told as a cause, though estimated anyway [s]")
-    map_changed: Share = key(0.4, "share of a given map that has changed from which the map itself is asked")
+    rejected: Share = rule(0.08, "share of rejected detections from which causes are asked")
+    innovations: Positive = rule(1.35, "mean squared normalised innovation, a number, from which causes are asked")
+    states: Positive = rule(
+        4.0, "standard deviations of a calibration state from its prior from which causes are asked"
+    )
+    noise: Positive = rule(3.0, "factor of a noise level on what is stated from which causes are asked")
+    late_s: Positive = rule(0.1, "delay of a clock from which it is told as a cause, though estimated anyway [s]")
+    map_changed: Share = rule(0.4, "share of a given map that has changed from which the map itself is asked")
     lead_nats: NotNegative = key(6.0, "log evidence by which a cause must win, its price paid [nats]")
-    most_causes: Count = key(2, "causes that are combined, at most")
-    most_tried: Count = key(4, "causes under which a session is solved again, for each that is added, at most")
-    most_solutions: Count = key(12, "solutions in all, at most")
+    most_causes: Count = rule(2, "causes that are combined, at most")
+    most_tried: Count = rule(4, "causes under which a session is solved again, for each that is added, at most")
+    most_solutions: Count = rule(12, "solutions in all, at most")
 
 
 class NoiseConfig(Section):
@@ -204,7 +210,7 @@ class NoiseConfig(Section):
     sideways_by_distance: Positive = key(0.03, "of sideways motion, by distance [m/sqrt(m)]")
     turn_by_time: Positive = key(0.01, "of turning, by time [rad/sqrt(s)]")
     turn_by_turn: Positive = key(0.05, "of turning, by angle turned [rad/sqrt(rad)]")
-    pseudo_count: Positive = key(1.0, "pseudo-residuals of these levels")
+    pseudo_count: Positive = rule(1.0, "pseudo-residuals of these levels")
 
 
 class SlamConfig(Section):
@@ -230,10 +236,10 @@ class SlamConfig(Section):
         7.0, "an outlier is as likely as an inlier at a squared normalised residual of twice this", gt=0, le=50
     )
     fewest_sightings: Count = key(3, "fewest sightings that locate a landmark: one or two may have a wrong identity")
-    rejected_in_a_row: Count = key(
+    rejected_in_a_row: Count = rule(
         5, "sightings of a landmark in a row, rejected as outliers, from which another optimum is sought"
     )
-    narrowing: tuple[Positive, ...] = key(
+    narrowing: tuple[Positive, ...] = rule(
         (10.0, 3.0), "noise of detections on the way to that optimum, as multiples of what it is"
     )
     estimate_noise: bool = key(True, "learn noise levels from the recording; off: keep the nominal ones")

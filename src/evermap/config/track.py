@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from evermap.config.section import Count, NotNegative, Positive, Section, Share, key, part
+from evermap.config.section import Count, NotNegative, Positive, Section, Share, key, part, rule
 from evermap.errors import ConfigError
 from evermap.types import DEFAULT_PRIOR, FloatArray
 
@@ -14,34 +14,36 @@ from evermap.types import DEFAULT_PRIOR, FloatArray
 class StillConfig(Section):
     """Which tracks of boxes stand and which move, by all of their detections."""
 
-    sigma_m: Positive = key(0.1, "error of where a box is detected, at no range [m] ...")
-    sigma_share: NotNegative = key(0.01, "... and as a share of its range")
-    alike_s: NotNegative = key(0.5, "for how long such errors are alike [s]")
-    still: Positive = key(0.25, "standard deviation of a static object's velocity, over its class's speed limit")
-    moving: Positive = key(4.8, "the same of what moves; at the limit both are as probable")
-    window_s: Positive = key(2.0, "time over which a velocity is estimated [s]")
-    least_s: Positive = key(0.4, "time that a track or a stay must last [s] ...")
-    fewest: Count = key(4, "... and detections that it takes")
-    p_stands: Share = key(0.9, "probability from which an object is taken to be static")
-    same_m: Positive = key(0.5, "stays this close are one [m]")
-    elsewhere_m: Positive = key(2.0, "what left was farther away than this [m]")
-    when_s: NotNegative = key(0.5, "when a thing came to rest, or left, is known to within this to both sides [s]")
+    sigma_m: Positive = rule(0.1, "error of where a box is detected, at no range [m] ...")
+    sigma_share: NotNegative = rule(0.01, "... and as a share of its range")
+    alike_s: NotNegative = rule(0.5, "for how long such errors are alike [s]")
+    still: Positive = rule(0.25, "standard deviation of a static object's velocity, over its class's speed limit")
+    moving: Positive = rule(4.8, "the same of what moves; at the limit both are as probable")
+    window_s: Positive = rule(2.0, "time over which a velocity is estimated [s]")
+    least_s: Positive = rule(0.4, "time that a track or a stay must last [s] ...")
+    fewest: Count = rule(4, "... and detections that it takes")
+    p_stands: Share = rule(0.9, "probability from which an object is taken to be static")
+    same_m: Positive = rule(0.5, "stays this close are one [m]")
+    elsewhere_m: Positive = rule(2.0, "what left was farther away than this [m]")
+    when_s: NotNegative = rule(0.5, "when a thing came to rest, or left, is known to within this to both sides [s]")
 
 
 class ShapeConfig(Section):
     """Sizes and headings of boxes, and what a detector makes of them."""
 
-    misplaced: float = key(16.0, "times the variance of its noise, of a box that is found beside its place ...", ge=1.0)
-    p_misplaced: Share = key(0.02, "... and how often that is")
-    other_size: Positive = key(0.25, "sizes of other objects differ by this share")
-    p_misshapen: Share = key(0.05, "share of detections with an arbitrary size or heading")
-    turning: NotNegative = key(0.5, "random walk of a heading: the end of a box moves sideways by this [m/sqrt(s)]")
-    resizing: NotNegative = key(0.01, "random walk of a size, as a share of it [1/sqrt(s)]")
-    forward_nats: Positive = key(3.0, "log odds that the heading of a detection is not reversed: one in 20 is")
-    most_forward_nats: Positive = key(
+    misplaced: float = rule(
+        16.0, "times the variance of its noise, of a box that is found beside its place ...", ge=1.0
+    )
+    p_misplaced: Share = rule(0.02, "... and how often that is")
+    other_size: Positive = rule(0.25, "sizes of other objects differ by this share")
+    p_misshapen: Share = rule(0.05, "share of detections with an arbitrary size or heading")
+    turning: NotNegative = rule(0.5, "random walk of a heading: the end of a box moves sideways by this [m/sqrt(s)]")
+    resizing: NotNegative = rule(0.01, "random walk of a size, as a share of it [1/sqrt(s)]")
+    forward_nats: Positive = rule(3.0, "log odds that the heading of a detection is not reversed: one in 20 is")
+    most_forward_nats: Positive = rule(
         7.0, "log odds that this may be sure by: three opposite detections turn it, two do not"
     )
-    sure_of_way: Positive = key(
+    sure_of_way: Positive = rule(
         9.0, "squared forward speed over its variance from which the motion decides the heading"
     )
 
@@ -55,63 +57,63 @@ class TrackerConfig(Section):
     motion_density: Positive = key(
         0.1, "spectral density, each axis, of white jerk [m^2/s^5] or white acceleration [m^2/s^3]"
     )
-    sigma_velocity_mps: Positive = key(1.0, "standard deviation of a new object's velocity, each axis [m/s]")
-    sigma_acceleration_mps2: Positive = key(0.5, "the same for its acceleration [m/s^2]")
+    sigma_velocity_mps: Positive = rule(1.0, "standard deviation of a new object's velocity, each axis [m/s]")
+    sigma_acceleration_mps2: Positive = rule(0.5, "the same for its acceleration [m/s^2]")
     sigma_position_m: Positive = key(0.3, "noise of a detection without a covariance, each axis [m]")
-    gate_probability: Share = key(0.9999, "share of an object's own detections within its gate")
+    gate_probability: Share = rule(0.9999, "share of an object's own detections within its gate")
     p_detect: Share = key(0.9, "probability to detect an object in view, without a detection model")
     clutter_per_m3: Positive = key(1e-4, "false detections and first sightings per frame and cubic metre")
-    p_real: Share = key(0.5, "probability that an unassigned detection is an object, not a false alarm")
-    sigma_face_m: NotNegative = key(0.05, "noise of the position of a face of a detected box [m] ...")
-    sigma_face_share: NotNegative = key(0.035, "... and as a share of the box's size")
-    speed_per_length_hz: NotNegative = key(
+    p_real: Share = rule(0.5, "probability that an unassigned detection is an object, not a false alarm")
+    sigma_face_m: NotNegative = rule(0.05, "noise of the position of a face of a detected box [m] ...")
+    sigma_face_share: NotNegative = rule(0.035, "... and as a share of the box's size")
+    speed_per_length_hz: NotNegative = rule(
         3.0, "standard deviation of a new box's speed along its heading, in its lengths per second [Hz]"
     )
-    score_midpoint: float = key(
+    score_midpoint: float = rule(
         3.7, "score at which a first detection is as likely real as false, unless all are in [0, 1]"
     )
-    score_scale: Positive = key(1.2, "increase of the score that adds one to the log odds of that")
-    score_memory: float = key(0.85, "weight of an object's older scores after each newer one", gt=0.0, le=1.0)
-    seen_nats: NotNegative = key(0.4, "factor on the log of the number of detections in the log odds of being real")
-    missed_nats: NotNegative = key(1.0, "reduction of the log odds of being real by every frame without a detection")
-    p_believed: Share = key(0.5, "belief by scores above which a tracklet is ALIVE, for detections with scores")
+    score_scale: Positive = rule(1.2, "increase of the score that adds one to the log odds of that")
+    score_memory: float = rule(0.85, "weight of an object's older scores after each newer one", gt=0.0, le=1.0)
+    seen_nats: NotNegative = rule(0.4, "factor on the log of the number of detections in the log odds of being real")
+    missed_nats: NotNegative = rule(1.0, "reduction of the log odds of being real by every frame without a detection")
+    p_believed: Share = rule(0.5, "belief by scores above which a tracklet is ALIVE, for detections with scores")
     p_confirm: Share = key(0.999, "belief above which a tracklet is ALIVE")
     p_dead: Share = key(0.01, "belief below which a tracklet is DEAD")
     warm_up: Count = key(3, "detections that a tracklet needs to be ALIVE")
-    lost_after: Count = key(3, "consecutive frames without a detection until a tracklet is LOST")
+    lost_after: Count = rule(3, "consecutive frames without a detection until a tracklet is LOST")
     max_missed: Count = key(
         10, "consecutive frames without a detection until it is deleted, or stored if it is at rest"
     )
-    vanish_rate_hz: NotNegative = key(1e-3, "rate at which objects in view cease to exist [1/s]")
+    vanish_rate_hz: NotNegative = rule(1e-3, "rate at which objects in view cease to exist [1/s]")
     class_speed_mps: Positive | tuple[Positive, ...] = key(
         0.5, "speed above which an object is dynamic [m/s]: one for all, or one per class"
     )
     rest_for_s: NotNegative = key(2.0, "time without motion before an object is static [s]")
     p_off_class: Share = key(0.05, "probability of a wrong class, without a confusion matrix")
-    appearance_nats: NotNegative = key(20.0, "log likelihood ratio between equal appearances and unrelated ones")
-    appearance_neutral: float = key(0.7, "cosine of two appearances that is no evidence", ge=-1.0, lt=1.0)
-    appearance_memory: float = key(0.9, "weight of the old appearance after a new detection", ge=0.0, lt=1.0)
+    appearance_nats: NotNegative = rule(20.0, "log likelihood ratio between equal appearances and unrelated ones")
+    appearance_neutral: float = rule(0.7, "cosine of two appearances that is no evidence", ge=-1.0, lt=1.0)
+    appearance_memory: float = rule(0.9, "weight of the old appearance after a new detection", ge=0.0, lt=1.0)
     place_sigma_m: Positive = key(0.2, "position tolerance of re-identification at rest, in addition to the noise [m]")
     moved_reach_m: NotNegative = key(
         0.0, "how far objects may be moved while out of view, 0 if never; needs appearances [m]"
     )
-    p_moved: Share = key(0.01, "probability of that")
+    p_moved: Share = rule(0.01, "probability of that")
     chunk_m: Positive = key(10.0, "side of the working set's square chunks [m]")
-    judge_every_s: NotNegative = key(
+    judge_every_s: NotNegative = rule(
         1.0, "time between two looks that are independent evidence about the working set [s]"
     )
 
-    least_p_detect: Share = key(1e-3, "least probability to detect an object: a model of the view is not exact")
-    fast_sigmas: Positive = key(2.33, "standard deviations above its class's speed from which an object is dynamic")
-    displaced: Positive = key(
+    least_p_detect: Share = rule(1e-3, "least probability to detect an object: a model of the view is not exact")
+    fast_sigmas: Positive = rule(2.33, "standard deviations above its class's speed from which an object is dynamic")
+    displaced: Positive = rule(
         30.66, "squared normalised distance at which a position is another place: one in a million"
     )
-    most_counted: Count = key(50, "largest number of detections that counts as evidence")
-    p_empty: Share = key(1e-3, "probability of misses in a row at which a place has been seen to be empty")
-    leave_rates_hz: tuple[Positive, Positive] = key(
+    most_counted: Count = rule(50, "largest number of detections that counts as evidence")
+    p_empty: Share = rule(1e-3, "probability of misses in a row at which a place has been seen to be empty")
+    leave_rates_hz: tuple[Positive, Positive] = rule(
         (1e-8, 1e-2), "rates of leaving a place, where nothing is known: from, to [1/s]"
     )
-    slow_step_s: Positive = key(2.0, "frame interval beyond which a warning says that motion is poorly observed [s]")
+    slow_step_s: Positive = rule(2.0, "frame interval beyond which a warning says that motion is poorly observed [s]")
     shape: ShapeConfig = part(ShapeConfig, "sizes and headings of boxes")
     still: StillConfig = part(StillConfig, "static objects beside a moving robot")
 
@@ -168,14 +170,14 @@ class TrackConfig(TrackerConfig):
         gt=0.0,
         le=360.0,
     )
-    all_around_deg: float = key(
+    all_around_deg: float = rule(
         225.0, "field of view from which on detections are of a sensor that sees all around [deg]", gt=0.0, le=360.0
     )
-    p_all_around: Share = key(
+    p_all_around: Share = rule(
         1e-4, "chance that a sensor that sees all around shows all that close together, below which the view is narrow"
     )
     min_score: float | None = key(None, "minimum score of detections; unset: none")
     gap_s: Positive | None = key(
         None, "a longer time between two frames counts as a gap without looks [s]; unset: chosen"
     )
-    gap_steps: float = key(10.0, "that time in usual steps, if gap_s is unset", gt=1.0)
+    gap_steps: float = rule(10.0, "that time in usual steps, if gap_s is unset", gt=1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from evermap.config.section import Count, NotNegative, Positive, Probability, Section, key
+from evermap.config.section import Count, NotNegative, Positive, Probability, Section, key, rule
 from evermap.types import DEFAULT_P_FALSE, DEFAULT_P_MISS, DEFAULT_PRIOR
 
 
@@ -31,11 +31,11 @@ class LiveConfig(Section):
     readings_hz: Positive = key(
         300.0, "maximum mean rate of readings that enter the map; above it, whole frames are left out"
     )
-    idle_s: Positive = key(60.0, "odometry that is kept where nothing is mapped, at least [s]")
-    clocks_s: Positive = key(5.0, "more than the clocks of one robot are apart [s]")
-    beliefs_s: Positive = key(300.0, "looks over so long become beliefs, and are not asked again [s]")
-    judge_s: Positive = key(5.0, "interval between searches for changes [s]")
-    look_s: Positive = key(0.5, "time between two frames whose looks are used for that [s]")
+    idle_s: Positive = rule(60.0, "odometry that is kept where nothing is mapped, at least [s]")
+    clocks_s: Positive = rule(5.0, "more than the clocks of one robot are apart [s]")
+    beliefs_s: Positive = rule(300.0, "looks over so long become beliefs, and are not asked again [s]")
+    judge_s: Positive = rule(5.0, "interval between searches for changes [s]")
+    look_s: Positive = rule(0.5, "time between two frames whose looks are used for that [s]")
 
 
 NO_RECURRENCE = "none"
@@ -52,8 +52,8 @@ class PersistConfig(Section):
     learn_from: int = key(
         100_000, "maximum number of looks to learn from: all looks at a random subset of features", ge=2
     )
-    most_features_alone: Count = key(32, "with more features, 'auto' learns one model for all")
-    fewest_looks_alone: Count = key(200, "looks per feature above which 'auto' learns a model for each")
+    most_features_alone: Count = rule(32, "with more features, 'auto' learns one model for all")
+    fewest_looks_alone: Count = rule(200, "looks per feature above which 'auto' learns a model for each")
     query: Literal["times", "grid"] = key(
         "times", "'times' asks for the belief at the time of every row, 'grid' at regular times"
     )
@@ -61,11 +61,11 @@ class PersistConfig(Section):
     horizon_s: Positive | None = key(
         None, "how far to forecast beyond the latest look [s]; unset: a share of the looks' span"
     )
-    forecast_steps: Count = key(10, "steps of a forecast, where step_s is unset")
-    grid_steps: Count = key(200, "about so many steps of the grid, where step_s is unset")
-    horizon_share: Positive = key(0.25, "horizon as a share of the span, where none is given")
+    forecast_steps: Count = rule(10, "steps of a forecast, where step_s is unset")
+    grid_steps: Count = rule(200, "about so many steps of the grid, where step_s is unset")
+    horizon_share: Positive = rule(0.25, "horizon as a share of the span, where none is given")
     confidence: float = key(0.9, "belief above which a change is reported", gt=0.5, lt=1.0)
-    tail: float = key(
+    tail: float = rule(
         0.025, "probability that a change lies before the interval given for it, and as much after it", gt=0.0, lt=0.5
     )
     p_miss: Probability = key(DEFAULT_P_MISS, "P(no detection | there) if the table has no p_miss")

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from evermap.config.living import LivingConfig
-from evermap.config.section import Section, _words_of, config_error, part
+from evermap.config.section import Section, _words_of, config_error, find_rule, is_rule, part
 from evermap.config.sensor import SensorConfig
 from evermap.config.slam import SlamConfig
 from evermap.config.track import TrackConfig
@@ -62,7 +62,27 @@ def load_config(
         ConfigError: unreadable file, unknown key (the nearest known one is named), or a value out of its bounds.
     """
     source = None if path is None else Path(path)
-    return _overridden(_validate(_read_toml(source), source), overrides, values or {}, within)
+    content = _read_toml(source)
+    _refuse_rules(content, (), source)
+    return _overridden(_validate(content, source), overrides, values or {}, within)
+
+
+def with_rules(config: Config, rules: Mapping[str, Any]) -> Config:
+    """Return `config` with values of rules and keys, by their dotted names: for experiments with the method itself."""
+    content = config.model_dump()
+    for name, value in rules.items():
+        _set(content, name, value, "")
+    return _validate(content, None)
+
+
+def _refuse_rules(content: Mapping[str, Any], prefix: tuple[str, ...], path: Path | None) -> None:
+    """Refuse rules among values that a user gave, before their types are checked."""
+    for name, value in content.items():
+        names = (*prefix, name)
+        if find_rule(Config, names):
+            raise _rule_error(names, path)
+        if isinstance(value, Mapping):
+            _refuse_rules(value, names, path)
 
 
 RETIRED = (
@@ -112,7 +132,10 @@ def refuse_unread(overrides: Iterable[str], unread: Mapping[str, Iterable[str]],
 
 
 def to_toml(config: Config) -> str:
-    """Return a commented TOML file that `load_config` reads back. Unset fields are commented out."""
+    """Return a commented TOML file that `parse_config` reads back, and `load_config` if no rule was changed.
+
+    Unset fields are commented out.
+    """
     return "\n".join(_table_lines(config, ())).lstrip("\n") + "\n"
 
 
@@ -137,6 +160,9 @@ def _overridden(config: Config, overrides: Iterable[str], values: Mapping[str, A
         key, equals, text = override.partition("=")
         if not equals or not all(name.strip() for name in key.split(".")):
             raise ConfigError(f"invalid setting '{override}'", hint="section.key=value, for example slam.seed=1")
+        names = _complete_key(key, within).split(".")
+        if find_rule(Config, names):
+            raise _rule_error(names, None)
         _set(content, key, _toml_value(text.strip()), within)
     for key, value in values.items():
         if value is not None:
@@ -169,6 +195,11 @@ def _toml_value(text: str) -> Any:
         return text
 
 
+def _rule_error(names: Iterable[str], path: Path | None) -> ConfigError:
+    hint = "rules of the method come with evermap; --show-config lists the keys"
+    return ConfigError("is no key that can be set", path=path, field=".".join(names), hint=hint)
+
+
 def _validate(values: Mapping[str, Any], path: Path | None) -> Config:
     """Return the checked configuration; the first thing that is wrong becomes one line."""
     try:
@@ -178,21 +209,20 @@ def _validate(values: Mapping[str, Any], path: Path | None) -> Config:
 
 
 def _table_lines(section: Section, prefix: tuple[str, ...]) -> Iterable[str]:
-    """Plain values first, then sub-tables, as TOML wants them."""
-    tables: list[tuple[str, Section]] = []
-    if prefix:
-        yield ""
-        yield f"[{'.'.join(prefix)}]"
+    """Plain values first, then sub-tables, as TOML wants them; of rules, those that were changed."""
+    tables, lines = list[str](), list[str]()
     for name, info in type(section).model_fields.items():
         value = getattr(section, name)
         if isinstance(value, Section):
-            tables.append((name, value))
+            tables += _table_lines(value, (*prefix, name))
+            continue
+        if is_rule(info) and value == info.default:
             continue
         words = " | ".join(_words_of(info.annotation))
-        yield f"# {info.description}{f' ({words})' if words else ''}"
-        yield f"# {name} =" if value is None else f"{name} = {_toml_text(value)}"
-    for name, table in tables:
-        yield from _table_lines(table, (*prefix, name))
+        said = f"# {name} =" if value is None else f"{name} = {_toml_text(value)}"
+        lines.append(f"{said}  # {info.description}{f' ({words})' if words else ''}")
+    head = ["", f"[{'.'.join(prefix)}]"] if prefix and lines else []
+    return [*head, *lines, *tables]
 
 
 def _toml_text(value: Any) -> str:
