@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
+from evermap.io.arrow import pa, parquet_bytes, pq
 from evermap.io.assemble import repeats
 from evermap.io.files import write_atomic
 from evermap.io.spatial import (
@@ -27,7 +28,7 @@ from evermap.io.spatial import (
     quaternions,
     upper_triangle,
 )
-from evermap.io.table import Table, csv_text, pa, parquet_bytes, pq
+from evermap.io.table import Table, csv_text
 from evermap.io.text import is_number, parse_json
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, Up, json_number
 from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
