@@ -488,7 +488,7 @@ def edit(name: str) -> Callable[..., None]:
 
     def command(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: ResultAsJson = False) -> None:
         from evermap.maps.store import open_store
-        from evermap.runs.sessions import edit_landmarks
+        from evermap.runs.edits import edit_landmarks
 
         with open_store(file) as store:
             parent = store.head()
@@ -525,7 +525,7 @@ def rename(
       evermap map rename site.evermap "chair K381" "chair at the door"
     """
     from evermap.maps.store import open_store
-    from evermap.runs.sessions import rename_landmark
+    from evermap.runs.edits import rename_landmark
 
     with open_store(file) as store:
         parent = store.head()

@@ -9,16 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from evermap.cli.options import (
-    AtRevision,
-    MapFile,
-    ResultAsJson,
-    option,
-)
-from evermap.cli.terminal import (
-    print_json,
-    say,
-)
+from evermap.cli.options import AtRevision, MapFile, ResultAsJson, option
+from evermap.cli.terminal import print_json, say
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:

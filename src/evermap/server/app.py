@@ -30,7 +30,7 @@ from evermap.maps.store.postgres import SITE
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.why import why as of_landmark
 from evermap.runs import map_dicts
-from evermap.runs.sessions import WORDS, edit_landmarks, rename_landmark
+from evermap.runs.edits import WORDS, edit_landmarks, rename_landmark
 from evermap.runs.summary import change_dict
 from evermap.server.database import AWAY, Job, JobState, Role
 from evermap.server.events import describe_revision, find_head, follow_map
