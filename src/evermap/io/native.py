@@ -1,4 +1,4 @@
-"""The native recording: a folder of CSV or Parquet tables and a `sensor.toml`, as `docs/formats.md` lays down."""
+"""The native recording: a folder of CSV or Parquet tables and a `sensor.toml`, as `docs/native-format.md` lays down."""
 
 from __future__ import annotations
 
