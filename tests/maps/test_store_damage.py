@@ -74,7 +74,7 @@ def test_a_file_that_was_cut_off_is_damaged(path: Path, share: float) -> None:
 
 def test_a_part_that_is_missing_is_found(path: Path) -> None:
     with open_store(path) as store, store._transaction() as connection:  # type: ignore[attr-defined]
-        kept = store._record(connection, 1).content  # type: ignore[attr-defined]
+        kept = store._chain.record_of(connection, 1).content  # type: ignore[attr-defined]
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM chunk WHERE name = ?", (kept,))
     database.close()
