@@ -178,7 +178,7 @@ def test_sessions_and_pruning_go_on(path: Path, tmp_path: Path) -> None:
         assert isinstance(store, SqlStore)
         with store._transaction() as connection:
             packs = list_packs(connection)
-            listed = [row for row in store.rows() if len(row) == 2 and row[1][:1] == b"\xfd"]
+            listed = [row for row in store.rows() if len(row) == 2 and row[1].startswith(b"\xfd7zXZ")]
         assert {row[0] for row in listed} == packs.keys()
 
 

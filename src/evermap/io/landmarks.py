@@ -129,7 +129,7 @@ def write_map_csv(landmarks: Landmarks, path: str | Path) -> Path:
 
 
 def map_columns(landmarks: Landmarks) -> dict[str, Any]:
-    """Return the columns of a map, in the order of `docs/map-files.md`: class ids as labels, `name` where any has one."""
+    """Return the columns of a map, in the order of `docs/map-files.md`: classes as labels, `name` where any has one."""
     names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
     return {
         **survey_columns(landmarks),
