@@ -67,3 +67,6 @@ def test_what_was_stated_keeps_its_form() -> None:
             found.log_survival(np.array([5.0, 70.0, 150.0])), -factor * np.array([0.1, 1.4, 3.0])
         )
         assert (found is stated) == (factor == 1.0)
+    twice = np.array([[1.0, 2.0, 1.0]]) / 50.0  # between 10 and 100 s only
+    found = HazardPosterior(EDGES_S, twice, one, stated, np.zeros(3), np.zeros(3)).prior()
+    np.testing.assert_allclose(found.log_survival(np.array([5.0, 70.0, 150.0])), [-0.1, -2.6, -4.8])
