@@ -25,9 +25,10 @@ from hypothesis.errors import Unsatisfiable
 
 from evermap.maps.store import open_store
 from evermap.runs.sessions import enter_session
-from evermap.server.app import Server, create_app
+from evermap.server.app import create_app
 from evermap.server.database import Database, Role
 from evermap.server.sites import SiteStores
+from evermap.server.state import Server
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 SITE = "ward"

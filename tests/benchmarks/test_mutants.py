@@ -73,3 +73,15 @@ def test_what_no_test_notices_survives(
     assert "survived: src/evermap/maps/toy.py:7 clipped: Gt to GtE" in told
     assert mutants.main(["maps", "--out", str(out)]) == 0, "rows that are there are not run again"
     assert len(out.read_text().splitlines()) == len(fate)
+
+
+def test_whether_lengths_are_compared_is_not_mutated() -> None:
+    (function,) = [
+        one for _, one in mutants.functions_of(ast.parse("def f(a, b): return dict(zip(a, b, strict=True))"))
+    ]
+    assert [what for node in mutants.nodes_of(function) for what, _ in mutants.changes_of(node)] == []
+
+
+@pytest.mark.parametrize("name", ["kernel", "inlined", "vectorised", "njit(cache=True)"])
+def test_what_is_compiled_is_not_mutated(name: str) -> None:
+    assert list(mutants.functions_of(ast.parse(f"@{name}\ndef f(a):\n    return a + 1"))) == []

@@ -223,7 +223,7 @@ def test_tables_are_written_and_read_without_pandas(tmp_path: Path) -> None:
 import sys
 import numpy as np
 from evermap.io.columns import csv_bytes, named, read_columns
-from evermap.io.table import parquet_bytes
+from evermap.io.arrow import parquet_bytes
 from evermap.valid import Quantity
 
 numbers = np.array([1.5, np.nan, 3.0])

@@ -1,4 +1,4 @@
-"""The page about formats tells the truth: its example is a recording, and its columns are those of the files."""
+"""The pages about files tell the truth: their example is a recording, and their columns are those of the files."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from evermap.types import (
 )
 
 
-def page(repository: Path) -> str:
-    return (repository / "docs" / "formats.md").read_text(encoding="utf-8")
+def page(repository: Path, name: str) -> str:
+    return (repository / "docs" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def test_the_complete_example_is_a_recording(repository: Path, tmp_path: Path, check_recording: Callable) -> None:
-    section = page(repository).split("### A complete example")[1].split("\n### ")[0]
+    section = page(repository, "native-format").split("## A complete example")[1].split("\n## ")[0]
     files = dict(re.findall(r"`(\w+\.\w+)`[^`]*```\w+\n(.*?)```", section, re.DOTALL))
     assert set(files) == {"odometry.csv", "detections.csv", "frames.csv", "sensor.toml"}
     for name, text in files.items():
@@ -48,7 +48,7 @@ def test_the_complete_example_is_a_recording(repository: Path, tmp_path: Path, c
 
 
 def test_the_defaults_of_the_sensor_file_are_those_of_the_program(repository: Path) -> None:
-    text = re.search(r"```toml\n(\[recording\].*?)```", page(repository), re.DOTALL)
+    text = re.search(r"```toml\n(\[recording\].*?)```", page(repository, "native-format"), re.DOTALL)
     assert text is not None
     settings = parse_sensor_toml(text[1].encode(), Path("sensor.toml"))
     default = Settings()
@@ -59,7 +59,7 @@ def test_the_defaults_of_the_sensor_file_are_those_of_the_program(repository: Pa
 
 
 def test_all_map_columns_are_listed(repository: Path, tmp_path: Path) -> None:
-    plane, _, space = page(repository).split("\n## Maps")[1].split("\n## ")[0].partition("\n### Maps in space")
+    plane, space = page(repository, "map-files").split("\n## ")[:2]
     flat = Landmarks.at([1], [[0, 0]])
     written = pq.read_table(write_map_parquet(flat, tmp_path / "map.parquet")).column_names
     assert column_names(plane) == written
@@ -76,7 +76,7 @@ def column_names(section: str) -> list[str]:
 
 
 def test_the_example_of_cameras_is_read(repository: Path, tmp_path: Path) -> None:
-    text = re.search(r"```toml\n(\[camera.*?)```", page(repository), re.DOTALL)
+    text = re.search(r"```toml\n(\[camera.*?)```", page(repository, "recordings-in-space"), re.DOTALL)
     assert text is not None
     (tmp_path / "camera.toml").write_text(text[1])
     (tmp_path / "detections.csv").write_text(
@@ -98,7 +98,7 @@ def test_all_keys_of_summaries_and_changes_are_listed(repository: Path) -> None:
     recording = Recording("", Odometry(*np.zeros((4, 0))), Frames(np.zeros(0)), Detections(*[none] * 8))
     summary = summary_dict(recording, result, {}, config={}, info=RunInfo(), timing={})
     summary["outputs"] = []  # of `RunFolder.finish`
-    section = page(repository).split("## Summary and changes")[1].split("\n## ")[0]
+    section = page(repository, "outputs").split("## Summary and changes")[1].split("\n## ")[0]
     keys = section.partition("Errors in `metrics`")[0]
     listed = re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in keys.splitlines() if line[:3] == "| `"))
     assert sorted([*listed, "schema_version"]) == sorted(summary)

@@ -58,6 +58,14 @@ def test_a_replacement_is_one_change_until_more_is_told_of_either() -> None:
     left = told(VANISHED, 2, at=20.0)
     found = net([((other,), False), ((left,), False)], before, a_map({}, away=(1, 2)))
     assert [(one.kind, one.landmark_ids) for one in found] == [(VANISHED, (1,))]
+    assert (found[0].n_hits, found[0].n_misses) == (0, 2)  # its hits were those of what came
+    back = told(RETURNED, 1, at=20.0, by=(0.0, 0.0))
+    found = net([((other,), False), ((back,), False)], before, a_map({1: HERE, 2: THERE}))
+    assert [(one.kind, one.landmark_ids) for one in found] == [(APPEARED, (2,))]
+    assert (found[0].n_hits, found[0].n_misses) == (3, 0)
+    for one in found:
+        assert (one.stamp_from_s, one.stamp_to_s, one.probability) == (10.0, 15.0, 0.9)
+        assert np.isnan(one.displacement_m).all()
 
 
 def told(kind: ChangeKind, *names: int, at: float = 10.0, by: tuple[float, float] | None = None, p: float = 0.9):

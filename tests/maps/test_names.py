@@ -24,7 +24,7 @@ from evermap.maps.names import MOST, Renamed, anonymous_text, distinct_text, nam
 from evermap.maps.store import Provenance, open_store
 from evermap.maps.store.content import pack
 from evermap.maps.why import why
-from evermap.runs.sessions import rename_landmark
+from evermap.runs.edits import rename_landmark
 from evermap.types import ChangeKind, Landmarks, MapChange, landmark_code, landmark_id_of, landmark_label
 
 START_S = 1704105328.074

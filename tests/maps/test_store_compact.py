@@ -31,6 +31,8 @@ from evermap.maps.store import (
     sqlite,
     verify_store,
 )
+from evermap.maps.store.anchor import read_anchor
+from evermap.maps.store.chunk_table import fetch_chunks, list_packs
 from evermap.maps.store.content import PLAIN, DamagedError, deflate, inflate
 from evermap.maps.store.packs import make_pack, open_members, place_of
 from evermap.maps.store.sql import SqlStore
@@ -145,9 +147,9 @@ def test_the_newest_revision_is_in_no_pack(path: Path) -> None:
         with open_store(path) as store:
             assert isinstance(store, SqlStore)
             with store._transaction() as connection:
-                (number, record), fetch = store._anchor(connection), partial(store._fetched, connection)
-                newest = {record, *store._record(connection, number).chunks(fetch)}
-                packed = set().union(*store._packs(connection).values())
+                (number, record), fetch = read_anchor(connection), partial(fetch_chunks, connection)
+                newest = {record, *store._chain.record_of(connection, number).chunks(fetch)}
+                packed = set().union(*list_packs(connection).values())
             assert packed
             assert not newest & packed
             store.revert(2)
@@ -175,8 +177,8 @@ def test_sessions_and_pruning_go_on(path: Path, tmp_path: Path) -> None:
     with open_store(path) as store:
         assert isinstance(store, SqlStore)
         with store._transaction() as connection:
-            packs = store._packs(connection)
-            listed = [row for row in store.rows() if len(row) == 2 and row[1][:1] == b"\xfd"]
+            packs = list_packs(connection)
+            listed = [row for row in store.rows() if len(row) == 2 and row[1].startswith(b"\xfd7zXZ")]
         assert {row[0] for row in listed} == packs.keys()
 
 
@@ -238,9 +240,9 @@ def pack_of(path: Path, column: str, number: int) -> bytes:
     with open_store(path) as store:
         assert isinstance(store, SqlStore)
         with store._transaction() as connection:
-            record = store._record(connection, number)
-            name = record.parts(partial(store._fetched, connection))["content", column][0]
-            return next(pack for pack, members in store._packs(connection).items() if name in members)
+            record = store._chain.record_of(connection, number)
+            name = record.parts(partial(fetch_chunks, connection))["content", column][0]
+            return next(pack for pack, members in list_packs(connection).items() if name in members)
 
 
 def test_damage_of_a_pack_is_found_and_what_is_intact_is_kept(path: Path) -> None:
@@ -267,8 +269,8 @@ def test_a_damaged_map_is_not_compacted(path: Path) -> None:
     with open_store(path) as store:
         assert isinstance(store, SqlStore)
         with store._transaction() as connection:
-            record = store._record(connection, 3)
-            name = record.parts(partial(store._fetched, connection))["content", "places.position_m"][0]
+            record = store._chain.record_of(connection, 3)
+            name = record.parts(partial(fetch_chunks, connection))["content", "places.position_m"][0]
     with sqlite3.connect(path) as database:  # it can be inflated, to other values
         (data,) = database.execute("SELECT data FROM chunk WHERE name = ?", [name]).fetchone()
         other = deflate(PLAIN + inflate(data)[::-1])

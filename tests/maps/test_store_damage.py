@@ -74,7 +74,7 @@ def test_a_file_that_was_cut_off_is_damaged(path: Path, share: float) -> None:
 
 def test_a_part_that_is_missing_is_found(path: Path) -> None:
     with open_store(path) as store, store._transaction() as connection:  # type: ignore[attr-defined]
-        kept = store._record(connection, 1).content  # type: ignore[attr-defined]
+        kept = store._chain.record_of(connection, 1).content  # type: ignore[attr-defined]
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM chunk WHERE name = ?", (kept,))
     database.close()
@@ -294,3 +294,22 @@ def test_a_full_disk_loses_nothing(path: Path) -> None:
         with pytest.raises(InputError, match=r"cannot be written: the disk is full \(try: free some space\)"):
             store.commit(random_map(5, cliques=100), Provenance(), parent=3)
     use_all(path)
+
+
+@pytest.mark.parametrize(
+    ("intact", "damaged", "what", "whole"),
+    [
+        ((1,), {2: "gone"}, "revision 2: gone", "revision 1 is intact (try: evermap map revert m 1)"),
+        ((1, 3), {2: "a", 4: "b"}, "revision 2: a, and 1 more revisions",
+         "revisions 1 and 3 are intact (try: evermap map revert m 3)"),
+        ((), {1: "a"}, "revision 1: a", "no revision is intact (try: a copy of the file)"),
+    ],
+)  # fmt: skip
+def test_the_error_of_a_damaged_map_names_what_is_whole(
+    intact: tuple[int, ...], damaged: dict[int, str], what: str, whole: str
+) -> None:
+    found = sqlite.Verification(4, intact, damaged, (), (), 9, 999)
+    assert not found.sound
+    assert found.error("m").one_line() == f"m: damaged: {what}; {whole}"
+    assert found.error("m", "no such revision").one_line() == f"m: damaged: no such revision; {whole}"
+    assert found.error("m").intact == intact

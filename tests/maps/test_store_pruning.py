@@ -22,6 +22,8 @@ from evermap.maps.store import (
     revert_store,
     verify_store,
 )
+from evermap.maps.store.sql import SqlStore
+from evermap.maps.store.sqlite import snapshot
 from evermap.maps.why import why
 
 COUNT = 8
@@ -182,7 +184,7 @@ def test_the_map_goes_on_as_if_nothing_was_pruned(path: Path, tmp_path: Path) ->
 
 def test_from_a_damaged_map_nothing_is_deleted(path: Path) -> None:
     with open_store(path) as store, store._transaction() as connection:  # type: ignore[attr-defined]
-        content = store._record(connection, 7).content  # type: ignore[attr-defined]
+        content = store._chain.record_of(connection, 7).content  # type: ignore[attr-defined]
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM chunk WHERE name = ?", (content,))
     database.close()
@@ -265,3 +267,20 @@ def test_a_schema_that_is_called_another_is_found(path: Path, version: int) -> N
     database.close()
     with pytest.raises(EvermapError, match=r"its tables are of another|knows up to 5|of the row that names"):
         open_store(path).log()
+
+
+def test_a_snapshot_is_the_map_up_to_its_revision_and_refused_where_there_is_none(path: Path, tmp_path: Path) -> None:
+    with open_store(path) as store:
+        assert isinstance(store, SqlStore)
+        store.prune(4)
+        copy = tmp_path / "copy.evermap"
+        snapshot(store, copy, 6)
+        for missing in (4, COUNT + 1):
+            with pytest.raises(InputError, match=f"no revision {missing} with its content"):
+                snapshot(store, tmp_path / "none.evermap", missing)
+        assert not (tmp_path / "none.evermap").exists()
+        wanted = history(store, 6)
+    assert kept(copy) == [5, 6]
+    with open_store(copy) as store:
+        assert store.head() == 6
+        assert repr(history(store, 6)) == repr(wanted)

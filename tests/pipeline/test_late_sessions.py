@@ -21,7 +21,8 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, open_store
 from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.maps.why import why
-from evermap.runs.sessions import UnbridgedError, at_time
+from evermap.runs.replay import UnbridgedError
+from evermap.runs.sessions import at_time
 from evermap.types import MapChange, Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 

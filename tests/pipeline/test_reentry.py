@@ -22,7 +22,9 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import Provenance, RevisionKind, open_store, verify_store
 from evermap.maps.store.measured import RECORDING, pack_recording, unpack_recording
 from evermap.maps.store.sql import SqlStore
-from evermap.runs.sessions import UnbridgedError, begin_map, enter_session, reenter
+from evermap.runs.reentry import reenter
+from evermap.runs.replay import UnbridgedError
+from evermap.runs.sessions import begin_map, enter_session
 from evermap.types import SensorKind
 from evermap_studies.sim import BuildingConfig, simulate_building
 

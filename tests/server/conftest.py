@@ -59,9 +59,10 @@ def fleet(where: str) -> Iterator[Fleet]:
     from fastapi.testclient import TestClient
     from fleets import Fleet
 
-    from evermap.server.app import Server, create_app
+    from evermap.server.app import create_app
     from evermap.server.database import Database, Role
     from evermap.server.sites import SiteStores
+    from evermap.server.state import Server
 
     database = Database(where)
     server = Server(database, SiteStores(where))

@@ -23,7 +23,8 @@ from fastapi.testclient import TestClient
 
 from evermap.config import Config
 from evermap.maps.living import LivingMap
-from evermap.server.app import Server, create_app
+from evermap.server.app import create_app
+from evermap.server.state import Server
 from evermap.server.worker import Worker
 
 

@@ -18,7 +18,7 @@ from fleets import SQLITE_ONLY, Fleet, held, served
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from evermap.server.app import Gate
+from evermap.server.gate import Gate
 from evermap.server.uploads import UploadLimits
 
 

@@ -17,7 +17,7 @@ from fleets import SQLITE_ONLY, Fleet, held, served, wait_until
 def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """In PostgreSQL because they are announced, from other processes and after an outage too, else by asking."""
     announced = "postgresql" in fleet.where
-    monkeypatch.setattr("evermap.server.app._ALIVE_S", 1e9)  # else it asks now and then
+    monkeypatch.setattr("evermap.server.events._ALIVE_S", 1e9)  # else it asks now and then
     fleet.upload(zips[0])
     fleet.worker().step()
     headers = {"Authorization": f"Bearer {fleet.tokens['read']}"}
@@ -60,7 +60,7 @@ def end_listener(where: str) -> None:
 def test_a_revoked_token_is_told_no_more_events(
     fleet: Fleet, zips: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evermap.server.app._CHECKED_S", 0.5)
+    monkeypatch.setattr("evermap.server.events._CHECKED_S", 0.5)
     fleet.upload(zips[0])
     fleet.worker().step()
     with served(fleet) as url:

@@ -34,9 +34,10 @@ import uvicorn
 from evermap.config import Config
 from evermap.io import write_native
 from evermap.runs.sessions import enter_session
-from evermap.server.app import Server, create_app
+from evermap.server.app import create_app
 from evermap.server.database import Database, Role
 from evermap.server.sites import SiteStores
+from evermap.server.state import Server
 from evermap.server.uploads import UploadLimits, checked_digest
 from evermap.server.worker import Worker
 from evermap_studies.sim import BuildingConfig, simulate_building

@@ -27,8 +27,8 @@ from evermap.errors import ConfigError, InputError
 from evermap.io import read_native
 from evermap.maps.store import Provenance, open_store, verify_store
 from evermap.runs.sessions import enter_session
-from evermap.server.app import _since
 from evermap.server.database import Database, Role
+from evermap.server.events import _since
 from evermap.server.sites import SiteStores
 
 

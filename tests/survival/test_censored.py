@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import DataError
-from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 
 NAN, INF = float("nan"), float("inf")
 
@@ -44,3 +44,18 @@ def test_defaults_and_kinds() -> None:
     np.testing.assert_array_equal(data.exact, [True, False, False, False])
     np.testing.assert_array_equal(data.entry_s, np.zeros(4))
     np.testing.assert_array_equal(data.weight, np.ones(4))
+
+
+def test_a_stay_began_at_any_instant_since_the_look_before_it() -> None:
+    """Two instants of arrival each, in the middle of halves; what was there at the first look is left out."""
+    samples, stay = lifetimes_of_sightings(
+        [90.0, -np.inf, 200.0, 300.0], [100.0, 0.0, 208.0, 304.0],
+        [150.0, 50.0, 240.0, 305.0], [180.0, 60.0, np.inf, 310.0],
+        instants=2, least_stay_s=10.0,
+    )  # fmt: skip
+    np.testing.assert_array_equal(stay, [0, 0, 2, 2])
+    arrival = np.array([92.5, 97.5, 202.0, 206.0])
+    np.testing.assert_allclose(samples.left_s, np.array([150.0, 150.0, 240.0, 240.0]) - arrival)
+    np.testing.assert_allclose(samples.right_s, np.array([180.0, 180.0, np.inf, np.inf]) - arrival)
+    np.testing.assert_allclose(samples.entry_s, np.array([110.0, 110.0, 218.0, 218.0]) - arrival)
+    np.testing.assert_array_equal(samples.weight, 0.5)

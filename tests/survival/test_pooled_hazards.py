@@ -12,21 +12,14 @@ from evermap.survival import (
     Mixture,
     PiecewiseConstantHazard,
     Weibull,
+    hazard_grid,
     never_leaves,
-    pooled_hazards,
 )
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.pooled_hazards import (
-    DRAWS,
-    EDGES_S,
-    LEAST_DRAWS,
-    HazardPosterior,
-    Statement,
-    StayAges,
-    _learn_once,
-    _Likelihood,
-    learn_hazards,
-)
+from evermap.survival.hazard_grid import DRAWS, LEAST_DRAWS
+from evermap.survival.hazard_posterior import HazardPosterior
+from evermap.survival.pooled_hazards import EDGES_S, Statement, _learn_once, learn_hazards
+from evermap.survival.stay_likelihood import StayAges, StayLikelihood
 from evermap.types import IntArray
 
 HOUR_S, DAY_S = 3600.0, 86_400.0
@@ -55,7 +48,7 @@ def test_derivatives_of_the_likelihood_are_those_of_differences() -> None:
     gone[:3] = np.inf
     back, rate = np.array([0.0, 0.3, 0.3, 0.0, 0.2, 0.1, 0.0]), np.array([0.0, 0.0, 1e-5, 0.0, 1e-5, 0.0, 1e-5])
     stays = StayAges(first, last, gone, rng.uniform(0.5, 2.0, 7), np.zeros(7, int), np.full((7, 2), 3e4), back, rate)
-    likelihood = _Likelihood(stays, EDGES_S)
+    likelihood = StayLikelihood(stays, EDGES_S)
     hazard = 1e-5 * np.exp(rng.normal(0.0, 0.3, len(EDGES_S)))
     _, gradient, curvature = likelihood(hazard)
     for k in range(16, 23):
@@ -68,7 +61,7 @@ def test_derivatives_of_the_likelihood_are_those_of_differences() -> None:
 def test_the_likelihood_of_a_stay_is_that_of_its_law() -> None:
     """Of a constant hazard: entry, a bounded end, one that was observed, and none."""
     data = CensoredLifetimes.of([5.0, 9.0, 20.0, 7.0], [8.0, 9.0, np.inf, 30.0], [2.0, 0.0, 0.0, 7.0])
-    value, _, _ = _Likelihood(StayAges.of_samples(data), EDGES_S)(np.full(len(EDGES_S), 0.1))
+    value, _, _ = StayLikelihood(StayAges.of_samples(data), EDGES_S)(np.full(len(EDGES_S), 0.1))
     parts = [
         -0.3 + np.log(-np.expm1(-0.3)), -0.9 + np.log(0.1) + np.log(9e-9), -2.0, np.log(-np.expm1(-2.3)),
     ]  # fmt: skip
@@ -151,8 +144,8 @@ def test_likely_members_of_the_grid_have_most_draws() -> None:
     assert len(few.weight) < 3 * DRAWS
     assert few.weight[-LEAST_DRAWS:].sum() < 0.06
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pooled_hazards, "LEAST_DRAWS", 16 * DRAWS)
-        patch.setattr(pooled_hazards, "NEGLIGIBLE", 0.0)
+        patch.setattr(hazard_grid, "LEAST_DRAWS", 16 * DRAWS)
+        patch.setattr(hazard_grid, "NEGLIGIBLE", 0.0)
         _learn_once.cache_clear()
         many = learned(data)
         _learn_once.cache_clear()

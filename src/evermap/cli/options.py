@@ -46,6 +46,9 @@ Settings = Annotated[
 ]
 ShowConfig = Annotated[bool, option("--show-config", "Print the configuration in force as commented TOML and exit.")]
 AsJson = Annotated[bool, option("--json", "Print the summary as JSON.")]
+ResultAsJson = Annotated[bool, option("--json", "Print as JSON.")]
+MapFile = Annotated[str, argument("The map, as `evermap slam --map FILE` writes it.", metavar="FILE")]
+AtRevision = Annotated[int | None, option("--revision", "Use this revision.", metavar="N", default="newest")]
 Force = Annotated[bool, option("--force", "Write into --out even if it holds other files; these are kept.")]
 UnknownIds = Annotated[
     bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")

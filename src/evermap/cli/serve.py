@@ -89,8 +89,9 @@ def serve(
         raise ConfigError("is not an address", field="--public-url", hint="https://maps.example.com")
     database = _database(store)
     uvicorn = _uvicorn()
-    from evermap.server.app import Server, create_app, prepare
+    from evermap.server.app import create_app
     from evermap.server.sites import SiteStores
+    from evermap.server.state import Server, prepare
     from evermap.server.worker import Crew
 
     listener = listening_at(host, port)

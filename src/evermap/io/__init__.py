@@ -1,4 +1,4 @@
-"""Readers and writers: recordings, maps and trajectories in files. `docs/formats.md` describes every format."""
+"""Readers and writers: recordings, maps and trajectories in files. `docs/formats.md` lists every format."""
 
 from __future__ import annotations
 

@@ -14,26 +14,22 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.files import unpacked
-from evermap.io.table import (
-    FORMULA,
-    NamedColumns,
-    Table,
+from evermap.io.arrow import (
     arrow_cells,
     arrow_csv,
     coded,
     dates_as_text,
     floats_of,
-    guarded,
     mapped,
     numbers_of_text,
     one_array,
     pa,
-    parse_csv,
     pc,
     pq,
     read_parquet,
 )
+from evermap.io.files import unpacked
+from evermap.io.table import FORMULA, NamedColumns, Table, guarded, parse_csv
 from evermap.io.text import quote, reason
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray
 from evermap.valid import Quantity

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
+from evermap.io.arrow import pa, parquet_bytes, pq
 from evermap.io.assemble import repeats
 from evermap.io.files import write_atomic
 from evermap.io.spatial import (
@@ -27,7 +28,7 @@ from evermap.io.spatial import (
     quaternions,
     upper_triangle,
 )
-from evermap.io.table import Table, csv_text, pa, parquet_bytes, pq
+from evermap.io.table import Table, csv_text
 from evermap.io.text import is_number, parse_json
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, Up, json_number
 from evermap.valid import FEATURES, P_EXISTS, STAMP_S, X_M, Y_M, Quantity
@@ -66,7 +67,7 @@ def landmarks_from_table(
     clock: Clock = Clock.RECORDING,
     names: dict[int, str] | None = None,
 ) -> Landmarks:
-    """Return landmarks of a table with the columns of `docs/formats.md`, sorted by id.
+    """Return landmarks of a table with the columns of `docs/map-files.md`, sorted by id.
 
     Raises:
         InputError: a column or value is not what it must be, or an id appears twice.
@@ -111,7 +112,7 @@ def survey_of(table: Table | None, **how: Any) -> Landmarks | None:
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
-    """Write a map as Parquet, one row a landmark, columns as in `docs/formats.md`. Returns the path.
+    """Write a map as Parquet, one row a landmark, columns as in `docs/map-files.md`. Returns the path.
 
     `read_landmarks` gives back equal arrays.
     """
@@ -128,7 +129,7 @@ def write_map_csv(landmarks: Landmarks, path: str | Path) -> Path:
 
 
 def map_columns(landmarks: Landmarks) -> dict[str, Any]:
-    """Return all columns of a map, in the order of `docs/formats.md`: class ids as labels, `name` where any has one."""
+    """Return the columns of a map, in the order of `docs/map-files.md`: classes as labels, `name` where any has one."""
     names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
     return {
         **survey_columns(landmarks),

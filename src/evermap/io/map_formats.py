@@ -18,6 +18,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
+from evermap.io.arrow import pa, parquet_bytes, pq
 from evermap.io.file_kinds import kind_of_file
 from evermap.io.files import content_of, write_atomic
 from evermap.io.landmarks import (
@@ -52,7 +53,7 @@ from evermap.io.map_tables import (
     wpilib_columns,
 )
 from evermap.io.spatial import AT, COVARIANCE, QUATERNION, TURN_COVARIANCE
-from evermap.io.table import Table, csv_text, pa, parquet_bytes, parse_csv, parse_parquet, pq
+from evermap.io.table import Table, csv_text, parse_csv, parse_parquet
 from evermap.io.tag_maps import (
     DEGREES,
     TAGSLAM_UNITS,

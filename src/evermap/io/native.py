@@ -1,4 +1,4 @@
-"""The native recording: a folder of CSV or Parquet tables and a `sensor.toml`, as `docs/formats.md` lays down."""
+"""The native recording: a folder of CSV or Parquet tables and a `sensor.toml`, as `docs/native-format.md` lays down."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from evermap import valid as q
 from evermap.errors import DataError, InputError, similar, suggestion
 from evermap.geometry import se2
+from evermap.io.arrow import parquet_of
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.bad_rows import Flaw, flaw_of
 from evermap.io.columns import DataFrame, arrow_table
@@ -21,7 +22,7 @@ from evermap.io.measurements import measurement_names, read_measurements
 from evermap.io.native_space import in_space, spatial_recording, truth_of
 from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml, toml_text
-from evermap.io.table import ENDINGS, Table, parquet_of, parse_table
+from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tagslam import is_tagslam
 from evermap.types import (
     Clock,

@@ -1,4 +1,4 @@
-"""The tables of a native recording in space, as `docs/formats.md` lays down; `native` reads the files."""
+"""The tables of a native recording in space, as `docs/recordings-in-space.md` lays down; `native` reads the files."""
 
 from __future__ import annotations
 

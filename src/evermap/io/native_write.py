@@ -13,6 +13,7 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.io.arrow import parquet_bytes
 from evermap.io.files import staged_folder, write_atomic
 from evermap.io.landmarks import labels_of, survey_columns
 from evermap.io.measurements import measurement_columns, measurement_names
@@ -20,7 +21,7 @@ from evermap.io.native_space import CORNERS, VARIANCES
 from evermap.io.rig_toml import SENSOR_FILE, rig_toml
 from evermap.io.sensor_toml import Settings, sensor_toml
 from evermap.io.spatial import AT, BOX, COVARIANCE, QUATERNION, upper_triangle
-from evermap.io.table import csv_text, parquet_bytes
+from evermap.io.table import csv_text
 from evermap.types import (
     UNKNOWN,
     Detections,

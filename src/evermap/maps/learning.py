@@ -38,8 +38,10 @@ from evermap.survival.class_lifetimes import (
     absence_log_likelihood,
     stay_log_likelihood,
 )
+from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.survival.hazards import scale_hazard
-from evermap.survival.pooled_hazards import HazardPosterior, Statement, StayAges, learn_hazards
+from evermap.survival.pooled_hazards import Statement, learn_hazards
+from evermap.survival.stay_likelihood import StayAges
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 
 USUAL = LifetimeConfig()

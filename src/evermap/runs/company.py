@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from evermap.config import Config
-    from evermap.runs.sessions import Reentered
+    from evermap.runs.reentry import Reentered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +176,7 @@ def _evidence(where: str, settings: LifetimeConfig) -> ClassEvidence:
 
 
 def _again(where: str, works: Mapping[str, Path], config: Config | None, adopt: bool) -> Reentered:
-    from evermap.runs.sessions import reenter
+    from evermap.runs.reentry import reenter
 
     return reenter(where, works[where], config, adopt=adopt)
 

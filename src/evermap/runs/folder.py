@@ -452,8 +452,8 @@ def _plain(config: Any) -> Any:
 
 
 def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
+    from evermap.io.arrow import parquet_bytes
     from evermap.io.landmarks import write_map_geojson, write_map_parquet
-    from evermap.io.table import parquet_bytes
     from evermap.io.tum import write_tum
     from evermap.runs.object_changes import object_changes_text
 

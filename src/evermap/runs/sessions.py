@@ -7,53 +7,40 @@ kept with their revisions. So the map is the one that the right order would have
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap import __version__
-from evermap.config import Config, parse_config, to_toml
-from evermap.errors import ConfigError, DataError, EvermapError, InputError, printable
-from evermap.maps.diff import edits, grown
+from evermap.config import Config, to_toml
+from evermap.errors import ConfigError, DataError, InputError, printable
+from evermap.maps.diff import grown
 from evermap.maps.living import LivingMap
-from evermap.maps.store import (
-    Attachment,
-    MapStore,
-    Provenance,
-    PrunedRevisionError,
-    Revision,
-    RevisionKind,
-    StaleRevisionError,
-    open_store,
-)
-from evermap.maps.store.content import DamagedError
+from evermap.maps.store import Attachment, MapStore, Provenance, PrunedRevisionError, RevisionKind
 from evermap.maps.store.history import STORY, Chapter, pack_story
-from evermap.maps.store.measured import (
-    LOOKS,
-    RECORDING,
-    TRAJECTORY,
-    pack_looks,
-    pack_recording,
-    pack_trajectory,
-    unpack_recording,
+from evermap.maps.store.measured import LOOKS, RECORDING, TRAJECTORY, pack_looks, pack_recording, pack_trajectory
+from evermap.runs.replay import (
+    Step,
+    edit_again,
+    enter_again,
+    list_recordings,
+    list_steps,
+    read_recording_of,
+    settle_space,
+    with_words_of,
 )
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
-from evermap.types import Progress, VerdictKind, is_in_space
+from evermap.types import Progress, VerdictKind
 from evermap.valid import check_type
 
 if TYPE_CHECKING:
     from evermap.existence.lifetimes import Lifetimes
     from evermap.existence.sites import Evidence
-    from evermap.maps.lives import Life
     from evermap.maps.living import Members
     from evermap.maps.sessions.session import Session
-    from evermap.maps.store.sql import SqlStore
-    from evermap.types import AnyRecording, Clock, FloatArray, IntArray, Landmarks, MapChange
+    from evermap.types import AnyRecording, FloatArray, IntArray, Landmarks, MapChange
 
 
 ACCEPT = "mend it, or `living.accept = 'any'` to enter it as it is"
@@ -70,10 +57,6 @@ class TwiceError(InputError):
 
     revision: int = 0
     is_copy: bool = False
-
-
-class UnbridgedError(DataError):
-    """A late session after which a later one can no longer be localised; others may connect them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,15 +143,6 @@ class Entered(Shown):
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """A session (with its recording), or an edit, of a map's history."""
-
-    start_s: float
-    revision: Revision
-    recording: Attachment | None
-
-
 def enter_session(
     store: MapStore,
     recording: AnyRecording,
@@ -206,8 +180,8 @@ def enter_session(
     recording = in_its_space(recording, newest, config or Config())
     if len(newest.places):
         check_fits(recording, newest)
-    config = _of_its_space(recording, config)
-    gap_s, kept = (config or Config()).living.clock_gap_s, _recordings(store, head)
+    config = settle_space(recording, config)
+    gap_s, kept = (config or Config()).living.clock_gap_s, list_recordings(store, head)
     _refuse_twice(store, kept, pack_recording(recording), recording, anew=gap_s is not None)
     lineage = set(store.lineage(head))
     recording = place_session(recording, [item for item in store.log() if item.number in lineage], gap_s)
@@ -238,78 +212,6 @@ def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, so
     return store.commit(living, said, parent=store.head())
 
 
-WORDS: Mapping[str, Mapping[str, bool]] = {
-    "pinned": {"pinned": True}, "unpinned": {"pinned": False},
-    "deleted": {"deleted": True}, "undeleted": {"deleted": False},
-}  # fmt: skip
-"""Edits of landmarks by operators."""
-
-
-def edit_landmarks(
-    store: MapStore, landmarks: Sequence[str], word: str, *, note: str = "", command: str = ""
-) -> tuple[int, tuple[int, ...], str]:
-    """Commit an operator's edit of landmarks (ids or names) by one of `WORDS`, unless it changes nothing.
-
-    The log gets the `note`, and the `command` that was typed.
-
-    Returns:
-        The newest revision, the landmarks that changed, and what the log says.
-
-    Raises:
-        InputError: a landmark is not in the map.
-        StaleRevisionError: another commit came in between.
-    """
-    parent = store.head()
-    before = after = store.load(parent)
-    for name in landmarks:
-        after = after.edited(_landmark_of(store, before, parent, name), **WORDS[word])
-    changed = tuple(name for name, _ in edits(before.members, after.members))
-    if not changed:
-        return parent, (), f"already {word}"
-    listed = ", ".join(map(after.label, changed))
-    said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
-    origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
-    return store.commit(after, origin, parent=parent), changed, said
-
-
-def rename_landmark(
-    store: MapStore, landmark: str, name: str, *, note: str = "", command: str = ""
-) -> tuple[int, str, str]:
-    """Commit what an operator calls a landmark from now on, in all sessions, unless it is called so; '' takes his name
-    back. Its identity, by which it is found in recordings, stays.
-
-    Returns:
-        The newest revision, what the landmark is called in it, and what the log says.
-
-    Raises:
-        InputError: the landmark is not in the map, or it cannot be called so.
-        StaleRevisionError: another commit came in between.
-    """
-    parent = store.head()
-    before = store.load(parent)
-    identity = _landmark_of(store, before, parent, landmark)
-    after = before.with_name(identity, name)
-    was, called = before.label(identity), after.label(identity)
-    if was == called:
-        return parent, called, "it is called so already"
-    said = f"renamed landmark {was} to {called}" + (f": {note}" if note else "")
-    origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
-    return store.commit(after, origin, parent=parent), called, said
-
-
-def _landmark_of(store: MapStore, living: LivingMap, number: int, name: str) -> int:
-    """Return the id of a landmark of a revision by what it is called.
-
-    Raises:
-        InputError: it has none.
-    """
-    identity = living.landmark_called(name)
-    if identity not in living.members.landmark_id:
-        problem = f"no landmark {printable(name, 80)} in revision {number}"
-        raise InputError(problem, path=store.where, hint=f"evermap map show {store.where} --all")
-    return identity
-
-
 def _enter_late(
     store: MapStore,
     head: int,
@@ -325,7 +227,7 @@ def _enter_late(
     """
     from evermap.pipeline import run_session
 
-    steps, start_s = _history(store, head), float(recording.frames.stamp_s[0])
+    steps, start_s = list_steps(store, head), float(recording.frames.stamp_s[0])
     first = _first_again(steps, start_s)
     parent = steps[first].revision.parent
     try:
@@ -337,7 +239,7 @@ def _enter_late(
     later = sorted(steps[first:], key=lambda step: step.start_s)
     # ids that were given since are not given again
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
-    living = _with_words(living, newest, recording.clock)
+    living = with_words_of(living, newest, recording.clock)
     story: list[Chapter] = []
     looks: dict[int, tuple[Evidence, Members]] = {}
     for step in (step for step in later if step.start_s <= start_s):
@@ -358,15 +260,15 @@ def _enter_late(
 
 def _retold(
     store: MapStore,
-    step: _Step,
+    step: Step,
     living: LivingMap,
     story: list[Chapter],
     looks: dict[int, tuple[Evidence, Members]],
 ) -> LivingMap:
     """The map after a session or an edit that it has had before; what a session tells and saw is added to both."""
     if step.recording is None:
-        return _edited_again(store, step, living)
-    session = _session_again(store, step, living)
+        return edit_again(store, step, living)
+    session = enter_again(store, step, living)
     story.append(_chapter(step.revision.number, step.start_s, session.changes, living, session.living))
     looks[step.revision.number] = session.evidence, session.living.members
     return session.living
@@ -380,7 +282,7 @@ def _chapter(
     return Chapter(revision, start_s, changes, new, len(grown(known, after, changes)))
 
 
-def _first_again(steps: Sequence[_Step], start_s: float) -> int:
+def _first_again(steps: Sequence[Step], start_s: float) -> int:
     """The first step that is taken back: before it the map has no session that begins after one that is entered."""
     first = len(steps)
     while True:
@@ -434,24 +336,11 @@ def _refuse_twice(
     since_start = _since_start if anew else tuple
     mine = since_start(drive_of(fixed)) if alike else ()
     for number in alike:
-        other = _kept_recording(store, kept[number], number)
+        other = read_recording_of(store, kept[number], number)
         if type(other) is type(recording) and same_drive(mine, since_start(drive_of(repaired(other)))):
             same = f"'{printable(other.name, 80)}' has the same frames and readings"
             problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
             raise _twice(store, number, problem, is_copy=True)
-
-
-def _kept_recording(store: MapStore, kept: Attachment, number: int) -> AnyRecording:
-    """Return the recording that a revision keeps.
-
-    Raises:
-        InputError: this evermap cannot read it.
-    """
-    try:
-        return unpack_recording(store.attached(kept))
-    except DamagedError as error:
-        hint = "the evermap that wrote it, or a newer one"
-        raise InputError(f"revision {number}: {error}", path=store.where, hint=hint) from None
 
 
 def _twice(store: MapStore, number: int, problem: str, *, is_copy: bool) -> TwiceError:
@@ -486,244 +375,3 @@ def _ends(recording: AnyRecording) -> tuple[float, float]:
     """First and last stamp of a recording; nan without any."""
     stamp_s = recording.frames.stamp_s
     return (float(np.nanmin(stamp_s)), float(np.nanmax(stamp_s))) if len(stamp_s) else (np.nan, np.nan)
-
-
-def _recordings(store: MapStore, head: int) -> dict[int, Attachment]:
-    """Stored recordings of a revision and those before it."""
-    return {item.revision: item for item in store.attachments(store.lineage(head)) if item.name == RECORDING}
-
-
-def _history(store: MapStore, head: int) -> list[_Step]:
-    """Sessions and edits of the map at a revision, in the order in which they were committed; what comes in meanwhile
-    is no part of it.
-    """
-    kept, lineage = _recordings(store, head), set(store.lineage(head))
-    steps: list[_Step] = []
-    start_s = -np.inf
-    for revision in store.log():
-        if revision.number not in lineage or revision.provenance.kind is RevisionKind.REVERT:
-            continue
-        if revision.provenance.kind is RevisionKind.SESSION:
-            if revision.number not in kept:
-                raise InputError(
-                    f"revision {revision.number} has no stored recording, so that no session can be entered before it",
-                    path=store.where,
-                    hint=f"evermap map revert {store.where} {revision.parent}, then the sessions in order of time",
-                )
-            steps.append(_Step(revision.provenance.stamp_from_s, revision, kept[revision.number]))
-            start_s = max(start_s, revision.provenance.stamp_from_s)
-        else:  # an operator's word holds from the newest session on that he knew
-            steps.append(_Step(start_s, revision, None))
-    return steps
-
-
-def _edited_again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
-    for landmark, word in edits(store.members(step.revision.parent), store.members(step.revision.number)):
-        if landmark in living.members.landmark_id:
-            living = living.edited(landmark, **WORDS[word])
-    return living
-
-
-def _session_again(store: MapStore, step: _Step, living: LivingMap, config: Config | None = None) -> Session:
-    """A session that a map has had before, with its own settings unless there are others."""
-    from evermap.pipeline import run_session
-
-    assert step.recording is not None
-    number, robot = step.revision.number, step.revision.provenance.robot
-    recording = replace(_kept_recording(store, step.recording, number), robot=robot)
-    problem = f"revision {number} cannot be brought in again"
-    try:
-        config = _of_its_space(recording, config or parse_config(step.revision.provenance.config))
-        session = run_session(recording, living, config)
-    except DataError as error:
-        raise UnbridgedError(f"{problem}: {error}") from None
-    if session.slam.interrupted:  # half of a session must not take the place of the whole
-        raise KeyboardInterrupt("the map is unchanged")
-    if not session.found:  # what is in the map is not dropped
-        problem = f"{problem}: {session.set_aside[0]}"
-        raise UnbridgedError(problem, path=store.where, hint="sessions that overlap with both, then this one again")
-    return session
-
-
-def _of_its_space(recording: AnyRecording, config: Config | None) -> Config | None:
-    """Return settings by which a recording in space stays there, and one in the plane is no contradiction."""
-    stays = False if is_in_space(recording) else None
-    if config is None and stays is None:
-        return None
-    config = config or Config()
-    return config.model_copy(update={"slam": config.slam.model_copy(update={"plane": stays})})
-
-
-@dataclass(frozen=True, slots=True)
-class Reentered(Shown):
-    """Result of entering all sessions of a map again.
-
-    Attributes:
-        sessions: how many it has.
-        kept: how many of them an earlier attempt had entered already.
-        parent: the newest revision of the map, which they follow.
-        revision: the newest after them; `parent` where there are none.
-        adopted: whether the map has them.
-    """
-
-    sessions: int
-    kept: int
-    parent: int
-    revision: int
-    adopted: bool
-
-
-def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool = False) -> Reentered:
-    """Enter all sessions of a map again, in order of time, and the edits at their time, as revisions after its newest.
-
-    They are written to a copy of the map, the first as a revert to what there was before all sessions. An attempt that
-    was stopped is continued: what an earlier one entered alike, of the same recordings with the same settings by the
-    same evermap, is taken over. What reads the map sees the last of them or none.
-
-    Args:
-        where: the map, as `open_store` takes it.
-        work: file of the copy, which is there when all are entered.
-        config: settings of all sessions; None for those of each.
-        adopt: append them to the map itself, in one transaction; what came in meanwhile is entered, too.
-
-    Raises:
-        InputError: a session of the map keeps no recording, or what was before the first is pruned.
-        UnbridgedError: a session is not found any more; the map stays as it was.
-        DataError, NumericalError: as `pipeline.run_session`.
-    """
-    from evermap.maps.store.sql import SqlStore
-
-    with open_store(where) as store:
-        assert isinstance(store, SqlStore)
-        while True:
-            found = _reentered(store, work, config)
-            if not adopt or found.revision == found.parent:
-                return found
-            try:
-                with open_store(work) as entered:
-                    assert isinstance(entered, SqlStore)
-                    store.extend(entered)
-                return replace(found, adopted=True)
-            except StaleRevisionError:  # another process committed meanwhile
-                continue
-
-
-def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
-    from evermap.maps.store.sql import SqlStore
-    from evermap.maps.store.sqlite import snapshot
-
-    head = store.head()
-    steps = _history(store, head)
-    sessions = [step for step in steps if step.recording is not None]
-    if not sessions:
-        return Reentered(0, 0, head, head, adopted=False)
-    base = min(step.revision.parent for step in sessions)
-    steps = sorted((step for step in steps if step.revision.number > base), key=lambda step: step.start_s)
-    part, before = (work.with_name(f".{work.name}.{kind}") for kind in ("part", "before"))
-    earlier = max((path for path in (part, before, work) if path.exists()), key=_written_by, default=None)
-    if earlier == part:
-        earlier = part.replace(before)
-    part.unlink(missing_ok=True)
-    snapshot(store, part, head)
-    with open_store(part) as fresh:
-        assert isinstance(fresh, SqlStore)
-        fresh.revert(base, Provenance(note=f"all sessions of revision {head} again"))
-        kept = _taken_over(earlier, fresh, base, steps, config)
-        living = fresh.load()
-        if not kept:
-            newest = store.load(head)
-            living = _with_words(living, newest, newest.clock)
-        for step in steps[kept:]:
-            living = _entered_again(store, fresh, step, living, config)
-        revision = fresh.head()
-    part.replace(work)
-    before.unlink(missing_ok=True)
-    return Reentered(len(sessions), sum(s.recording is not None for s in steps[:kept]), head, revision, adopted=False)
-
-
-def _with_words(living: LivingMap, newest: LivingMap, clock: Clock) -> LivingMap:
-    """An earlier map with what users said of lifetimes, and what they call landmarks, which are of no time; one without
-    places gets a clock.
-    """
-    living = replace(living, renamed=newest.renamed)
-    lives = replace(living.lives, prior_class_id=newest.lives.prior_class_id, prior=newest.lives.prior)
-    living = replace(living, class_names=newest.class_names, lives=lives) if len(lives.prior) else living
-    return living if len(living.places) else replace(living, clock=clock)
-
-
-def _entered_again(
-    store: MapStore, fresh: MapStore, step: _Step, living: LivingMap, config: Config | None
-) -> LivingMap:
-    """Commit a session or an edit to the copy of a map; returns the map after it."""
-    said = step.revision.provenance
-    if step.recording is None:
-        living = _edited_again(store, step, living)
-        fresh.commit(living, said, parent=fresh.head())
-        return living
-    start = time.perf_counter()
-    session = _session_again(store, step, living, config)
-    if config is not None:
-        said = replace(said, config=to_toml(config), seed=config.slam.seed)
-    said = replace(said, wall_s=time.perf_counter() - start)
-    attached: dict[str, bytes | Attachment] = {RECORDING: step.recording}
-    attached[TRAJECTORY] = pack_trajectory(session.slam.trajectory)
-    parent = fresh.head()
-    fresh.commit(session.living, said, session.changes, session.evidence, parent=parent, attachments=attached)
-    return session.living
-
-
-def _written_by(earlier: Path) -> int:
-    """How many revisions an earlier attempt has written after its revert; 0 of a file that cannot be read."""
-    try:
-        with open_store(earlier) as store:
-            return store.head() - _last_revert(store)
-    except (EvermapError, ValueError):
-        return 0
-
-
-def _last_revert(store: MapStore) -> int:
-    return max(item.number for item in store.log() if item.provenance.kind is RevisionKind.REVERT)
-
-
-def _said(living: LivingMap) -> dict[str, Life]:
-    """Return the users' lifetime priors, by class; '' for all others."""
-    named = (*living.class_names, "")
-    return {named[kind]: prior for kind, prior in zip(living.lives.prior_class_id, living.lives.prior, strict=True)}
-
-
-def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[_Step], config: Config | None) -> int:
-    """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
-    from evermap.maps.store.sql import SqlStore
-
-    if earlier is None or not _written_by(earlier):
-        return 0
-    with open_store(earlier) as old:
-        assert isinstance(old, SqlStore)
-        log, start = {item.number: item for item in old.log()}, _last_revert(old)
-        same = old.named(log[start].restores)[1] == fresh.named(base)[1]
-        was, newest = old.load(), fresh.load(fresh.head() - 1)
-        if not same or _said(was) != _said(newest) or [*was.renamed.items()] != [*newest.renamed.items()]:
-            return 0
-        kept: dict[str, dict[int, Attachment]] = {RECORDING: {}, TRAJECTORY: {}}
-        for item in old.attachments():
-            kept.setdefault(item.name, {})[item.revision] = item
-        for count, step in enumerate(steps):
-            number = start + count + 1
-            wanted = replace(step.revision.provenance, wall_s=np.nan)
-            if step.recording is not None and config is not None:
-                wanted = replace(wanted, config=to_toml(config), seed=config.slam.seed)
-            digest = None if step.recording is None else step.recording.digest
-            if number not in log or log[number].evermap_version != __version__:
-                return count
-            if getattr(kept[RECORDING].get(number), "digest", None) != digest:
-                return count
-            said = log[number].provenance
-            if repr(replace(said, wall_s=np.nan)) != repr(wanted):  # nan is not equal to itself
-                return count
-            seen = old.evidence(revisions=[number])
-            attached: dict[str, bytes | Attachment] = {} if step.recording is None else {RECORDING: step.recording}
-            if number in kept[TRAJECTORY]:
-                attached[TRAJECTORY] = old.attached(kept[TRAJECTORY][number])
-            parent = fresh.head()
-            fresh.commit(old.load(number), said, old.changes(number), seen, parent=parent, attachments=attached)
-    return len(steps)

@@ -6,13 +6,9 @@ and is answered as JSON.
 
 from __future__ import annotations
 
-import asyncio
-import json
 import math
-import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict
 from importlib import resources
 from typing import Annotated, Any, Literal
 from uuid import uuid4
@@ -22,108 +18,31 @@ from fastapi import APIRouter, Body, Depends, FastAPI, Header, HTTPException, Pa
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.middleware.gzip import GZipMiddleware
-from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
+from fastapi.responses import HTMLResponse, StreamingResponse
 from pydantic import BaseModel, Field
-from starlette.datastructures import MutableHeaders
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from evermap import __version__
-from evermap.errors import EvermapError, InputError, printable
+from evermap.errors import EvermapError
 from evermap.maps.diff import diff as between
 from evermap.maps.diff import read_log, story_of
-from evermap.maps.living import LivingMap
-from evermap.maps.store import DamagedMapError, Provenance, Revision, StaleRevisionError, StoreUnavailableError
-from evermap.maps.store.postgres import PREFIX, SITE
+from evermap.maps.store import Provenance
+from evermap.maps.store.postgres import SITE
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.why import why as of_landmark
 from evermap.runs import map_dicts
-from evermap.runs.sessions import WORDS, edit_landmarks, rename_landmark
+from evermap.runs.edits import WORDS, edit_landmarks, rename_landmark
 from evermap.runs.summary import change_dict
-from evermap.server.database import AWAY, Database, Job, JobState, Role
-from evermap.server.sites import NoSuchSiteError, SiteStores
-from evermap.server.uploads import UploadLimits, checked_digest
-from evermap.types import Landmarks, json_number
+from evermap.server.database import AWAY, Job, JobState, Role
+from evermap.server.events import describe_revision, find_head, follow_map
+from evermap.server.gate import PAGE, Gate, PlainJSON, answer_mistake, answer_outage, answer_unread, server_of
+from evermap.server.state import Server
+from evermap.server.uploads import checked_digest
+from evermap.types import json_number
 
-_EVERY_S = 1.0
-"""Between two looks for new revisions, where none are announced."""
-_ALIVE_S = 15.0
-"""Interval between two keep-alive lines."""
-_CHECKED_S = 5.0
-"""Longest use of a token by a follower before it is looked up again."""
-_RATE_HZ, _BURST = 50.0, 200.0
-"""Rate and burst of requests per token, and per address of requests without a valid one."""
-_MOST_COUNTED = 10_000
-"""Tokens and addresses whose requests are counted; the one that has asked least recently is forgotten."""
-_UNPACKED_AT_ONCE = 2
-"""Uploads that are unpacked at the same time."""
 _LEAST_COMPRESSED = 1000
 """Answers of fewer bytes are sent as they are."""
 _EFFORT = 4
 """Of compression, 1 to 9: a tenth more bytes than at 9, in a sixth of the time."""
-_WARM = 16
-"""Maps that are loaded before the first request."""
-_HEADERS = {
-    "Content-Security-Policy":
-        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-cache",
-}  # fmt: skip
-_STATUS: dict[type[Exception], int] = {NoSuchSiteError: 404, StaleRevisionError: 409, DamagedMapError: 500}
-_PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
-_OPEN = {"/healthz", "/openapi.json", *(f"/{name}" for name in _PAGE)}
-"""Paths that need no token."""
-
-
-@dataclass(slots=True)
-class Server:
-    """State of a server.
-
-    Attributes:
-        database: tokens and the queue.
-        sites: the maps.
-        limits: of uploads.
-        rate_hz: requests of one token over time.
-        public_url: address at which robots reach the server; None for that of each request.
-        workers: counts the living worker processes that this server has started.
-    """
-
-    database: Database
-    sites: SiteStores
-    limits: UploadLimits = field(default_factory=UploadLimits)
-    rate_hz: float = _RATE_HZ
-    public_url: str | None = None
-    workers: Callable[[], int] = lambda: 0
-    unpacking: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(_UNPACKED_AT_ONCE))
-    _budget: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
-
-    def admits(self, kind: str, who: str) -> bool:
-        """Count a request of a token or an address; returns whether it is within the rate (a token bucket)."""
-        now = time.monotonic()
-        left, since = self._budget.pop((kind, who), (_BURST, now))
-        left = min(_BURST, left + (now - since) * self.rate_hz)
-        self._budget[kind, who] = (max(left - 1.0, 0.0), now)
-        if len(self._budget) > _MOST_COUNTED:
-            self._budget.pop(next(iter(self._budget)))
-        return left >= 1.0
-
-
-def prepare(server: Server) -> None:
-    """Load the code for reading, and some of the maps, so that no request waits for that."""
-    row, number = np.zeros(1), np.zeros(1, dtype=np.int64)
-    one = Landmarks(number, np.zeros((1, 2)), np.zeros((1, 2, 2)), number, row + 1.0, number, number, row, row)
-    living = LivingMap.begun(one).from_now_on(0.0)
-    map_dicts.landmark_dicts(living, living.p_exists(0.0))
-    for site in server.sites.names()[:_WARM]:
-        with suppress(EvermapError), server.sites.store(site) as store:
-            server.sites.living(store)
-
-
-class PlainJSON(JSONResponse):
-    """JSON in ASCII, so that any text of a map can be sent."""
-
-    def render(self, content: Any) -> bytes:
-        """Encode the answer."""
-        return json.dumps(content, allow_nan=False).encode("ascii")
 
 
 def create_app(server: Server) -> FastAPI:
@@ -134,117 +53,17 @@ def create_app(server: Server) -> FastAPI:
     app.include_router(router)
     app.add_middleware(GZipMiddleware, minimum_size=_LEAST_COMPRESSED, compresslevel=_EFFORT)
     app.add_middleware(Gate)
-    app.exception_handler(EvermapError)(_mistake)
-    app.exception_handler(RequestValidationError)(_unread)
+    app.exception_handler(EvermapError)(answer_mistake)
+    app.exception_handler(RequestValidationError)(answer_unread)
     for away in AWAY:
-        app.exception_handler(away)(_outage)
+        app.exception_handler(away)(answer_outage)
     return app
-
-
-class Gate:
-    """Middleware that looks at the token before anything reads the body, bounds the body, sends the security headers
-    of pages, and notes changes in the audit.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or let the application do it."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        request = Request(scope)
-        limits = _server(request).limits
-        most = left = limits.n_bytes if request.url.path.endswith("/sessions") else limits.body_bytes
-        refusal = await self._refusal(request, most)
-
-        async def bounded() -> Message:
-            nonlocal left
-            message = await receive()
-            left -= len(message.get("body", b""))
-            if left < 0:
-                raise HTTPException(413, f"more than {most} bytes")
-            return message
-
-        async def finished(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(_HEADERS)
-                await self._note(request, message["status"])
-            await send(message)
-
-        await (self._app if refusal is None else refusal)(scope, bounded, finished)
-
-    async def _refusal(self, request: Request, most: int) -> Response | None:
-        """Return what is answered without a look at the body; None for what the application answers."""
-        length = request.headers.get("content-length", "")
-        try:
-            if request.url.path not in _OPEN:
-                await run_in_threadpool(_identify, request)
-            if length.isdecimal() and int(length[:20]) > most:
-                raise HTTPException(413, f"more than {most} bytes")
-        except HTTPException as error:
-            return PlainJSON({"detail": error.detail}, error.status_code, error.headers)
-        except AWAY as error:
-            return await _outage(request, error)
-        return None
-
-    async def _note(self, request: Request, status: int) -> None:
-        """Note a change that somebody with a token has asked for."""
-        state = request.state
-        if request.method not in ("POST", "PUT") or not hasattr(state, "who") or getattr(state, "unchanged", False):
-            return
-        what = f"{request.method} {request.url.path} {getattr(state, 'said', '')}"
-        with suppress(*AWAY):  # the answer reports it
-            await run_in_threadpool(_server(request).database.note, state.who, what, status)
-
-
-def _identify(request: Request) -> None:
-    """Keep the name and the role of a request's token.
-
-    Raises:
-        HTTPException: there is none, or too many requests came with it, or without one from its address.
-    """
-    server, known = _server(request), _holder(request)
-    address = "" if request.client is None else request.client.host
-    if not (server.admits("address", address) if known is None else server.admits("token", known[0])):
-        raise HTTPException(429, "too many requests", {"Retry-After": "1"})
-    if known is None:
-        raise HTTPException(401, "a token is needed", {"WWW-Authenticate": "Bearer"})
-    request.state.who, request.state.role = known
-
-
-def _holder(request: Request) -> tuple[str, Role] | None:
-    """Return the name and the role of a request's token; None if it has no valid one."""
-    scheme, _, text = request.headers.get("authorization", "").partition(" ")
-    return _server(request).database.who(text.strip()) if scheme.lower() == "bearer" else None
-
-
-async def _mistake(request: Request, error: Exception) -> Response:
-    """Return one line, without paths of this machine."""
-    assert isinstance(error, EvermapError)
-    if isinstance(error, StoreUnavailableError):
-        return await _outage(request, error)
-    status = _STATUS.get(type(error), 404 if request.method == "GET" else 422)
-    what = f"{error.field}: {error.problem}" if error.field else error.problem
-    return PlainJSON({"detail": printable(what, 400)}, status)
-
-
-async def _unread(_: Request, error: Exception) -> Response:
-    """Return the error of a request, without repeating its content."""
-    assert isinstance(error, RequestValidationError)
-    told = [f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
-    return PlainJSON({"detail": printable("; ".join(told), 400)}, 422)
-
-
-async def _outage(_: Request, __: Exception) -> Response:
-    return PlainJSON({"detail": "the database does not answer"}, 503, {"Retry-After": "5"})
 
 
 def _told(request: Request, site: str, make: Callable[[SqlStore], Any]) -> Response:
     """Answer from a map alone, unchanged until there is a newer revision."""
     asked = f"{request.url.path}?{request.url.query}"
-    tag, found = _server(request).sites.answer(site, asked, lambda store: bytes(PlainJSON(make(store)).body))
+    tag, found = server_of(request).sites.answer(site, asked, lambda store: bytes(PlainJSON(make(store)).body))
     return _tagged(request, found, tag, "application/json")
 
 
@@ -254,12 +73,6 @@ def _tagged(request: Request, data: bytes, tag: str, media_type: str, **headers:
     if told["ETag"] in request.headers.get("if-none-match", ""):
         return Response(status_code=304, headers=told)
     return Response(data, media_type=media_type, headers=told)
-
-
-def _server(request: Request) -> Server:
-    server = request.app.state.server
-    assert isinstance(server, Server)
-    return server
 
 
 def _may(role: Role) -> Any:
@@ -276,7 +89,7 @@ def _may(role: Role) -> Any:
 
 async def _answering(request: Request) -> Server:
     """An asynchronous dependency that needs no thread, since it never waits."""
-    return _server(request)
+    return server_of(request)
 
 
 Answering = Annotated[Server, Depends(_answering)]
@@ -370,7 +183,7 @@ def page(request: Request) -> Response:
     """Serve the page, which asks for a token and shows the maps."""
     name = request.url.path.strip("/")
     text = resources.files("evermap.server").joinpath(name or "page.html").read_text(encoding="utf-8")
-    return HTMLResponse(text, media_type=_PAGE[name])
+    return HTMLResponse(text, media_type=PAGE[name])
 
 
 @router.get("/sites")
@@ -450,15 +263,9 @@ def list_revisions(
     """List the first `most` revisions after `since`, the oldest first; with `config` also the settings of each."""
 
     def listed(store: SqlStore) -> list[dict[str, Any]]:
-        return [_revision(item, config=config) for item in read_log(store) if item.number > (since or 0)][:most]
+        return [describe_revision(item, config=config) for item in read_log(store) if item.number > (since or 0)][:most]
 
     return _told(request, site, listed)
-
-
-def _revision(item: Revision, *, config: bool = False) -> dict[str, Any]:
-    """A line of the history, without the whole configuration unless it is asked for."""
-    told = map_dicts.revision_dict(item)
-    return {key: value for key, value in told.items() if config or key != "config"}
 
 
 @router.get("/maps/{site}/diff")
@@ -501,7 +308,7 @@ def landmarks(request: Request, site: Site, _: Reader, asked: Annotated[Landmark
     """List landmarks within a region; `p_ahead` is the probability that each is there at `at_s`."""
 
     def listed(store: SqlStore) -> dict[str, Any]:
-        number, living = _server(request).sites.living(store, asked.revision)
+        number, living = server_of(request).sites.living(store, asked.revision)
         found = map_dicts.landmark_dicts(living, None if asked.at_s is None else living.p_exists(asked.at_s))
         return {
             "site": site,
@@ -532,7 +339,7 @@ def lifetimes(request: Request, site: Site, _: Reader, revision: AtRevision = No
     """Return the lifetimes by class and place."""
 
     def told(store: SqlStore) -> dict[str, Any]:
-        living = _server(request).sites.living(store, revision)[1]
+        living = server_of(request).sites.living(store, revision)[1]
         return {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
 
     return _told(request, site, told)
@@ -670,72 +477,6 @@ async def events(
     whenever the approval, the robots' maps or the newest sessions have changed.
     """
     told = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 10 else since
-    head = await run_in_threadpool(_head, server, site)
+    head = await run_in_threadpool(find_head, server, site)
     told = head if told is None else min(told, head)
-    return StreamingResponse(_news(request, server, site, told), media_type="text/event-stream")
-
-
-async def _news(request: Request, server: Server, site: str, told: int) -> AsyncIterator[str]:
-    """Ask for news whenever some are announced, and where nothing arrives, every second."""
-    alive = checked = time.monotonic()
-    beat = await run_in_threadpool(_beat, server, site)
-    yield ": following\n\n"
-    news, loop, asked = asyncio.Event(), asyncio.get_running_loop(), -math.inf
-
-    def hear(what: str) -> None:
-        if what in ("", PREFIX + site):
-            with suppress(RuntimeError):  # the server has ended
-                loop.call_soon_threadsafe(news.set)
-
-    announced = server.database.announcements
-    with announced.followed(hear):
-        while not await request.is_disconnected():
-            if news.is_set() or time.monotonic() - checked > _CHECKED_S:
-                checked = time.monotonic()
-                if not await run_in_threadpool(_still_valid, request):
-                    return
-            if news.is_set() or not announced.arrive or time.monotonic() - asked > _ALIVE_S:
-                news.clear()
-                asked = time.monotonic()
-                if (now := await run_in_threadpool(_beat, server, site)) not in (None, beat):
-                    beat = now
-                    yield "event: beside\ndata: {}\n\n"
-                for number, text in await run_in_threadpool(_since, server, site, told):
-                    yield f"id: {number}\nevent: revision\ndata: {text}\n\n"
-                    told = number
-            if time.monotonic() - alive > _ALIVE_S:
-                alive = time.monotonic()
-                yield ": alive\n\n"
-            with suppress(TimeoutError):
-                await asyncio.wait_for(news.wait(), _EVERY_S)
-
-
-def _still_valid(request: Request) -> bool:
-    """Return whether a follower's token is not revoked, as far as the database answers."""
-    try:
-        return _holder(request) is not None
-    except AWAY:
-        return True
-
-
-def _head(server: Server, site: str) -> int:
-    with server.sites.store(site) as store:
-        return store.head()
-
-
-def _beat(server: Server, site: str) -> tuple[Any, ...] | None:
-    """Return a value that changes with the state beyond the map; None while the database does not answer."""
-    try:
-        return server.database.pulse(site)
-    except AWAY:
-        return None
-
-
-def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:
-    """Revisions after one, as events; none while the database does not answer."""
-    try:
-        with server.sites.store(site) as store:
-            new = store.log() if store.head() > told else ()
-            return [(item.number, json.dumps(_revision(item))) for item in new if item.number > told]
-    except (InputError, *AWAY):
-        return []
+    return StreamingResponse(follow_map(request, server, site, told), media_type="text/event-stream")

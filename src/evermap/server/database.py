@@ -24,9 +24,9 @@ from sqlalchemy.schema import CreateIndex, CreateSchema
 
 from evermap.errors import ConfigError, InputError, printable
 from evermap.maps.store import is_address
+from evermap.maps.store.anchor import announce, now_utc
 from evermap.maps.store.postgres import PREFIX, Announcements, split_address
 from evermap.maps.store.postgres import engine_of as postgres_engine
-from evermap.maps.store.sql import announce, now_utc
 from evermap.maps.store.sqlite import engine_of as sqlite_engine
 from evermap.server.sites import store_place
 from evermap.types import VerdictKind

@@ -17,7 +17,8 @@ from typing import Self
 from evermap.config import Config
 from evermap.errors import EvermapError
 from evermap.maps.store import StaleRevisionError, StoreUnavailableError
-from evermap.runs.sessions import TwiceError, UnbridgedError, enter_session
+from evermap.runs.replay import UnbridgedError
+from evermap.runs.sessions import TwiceError, enter_session
 from evermap.server.database import AWAY, MOST_TRIES, Database, Job, JobState
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import recording_of

@@ -9,6 +9,8 @@ import numpy as np
 
 from evermap.types import FloatArray
 
+TINY = 1e-300
+"""In place of 0 where a logarithm or a quotient is taken."""
 _EULER_GAMMA = 0.5772156649015328606
 _SMOOTH_RATIO = 0.1
 """Below this difference of `log H` between two times, integrating the hazard is more exact than subtracting."""

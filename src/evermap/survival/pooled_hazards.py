@@ -20,36 +20,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share, check_times
-from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.hazard_regression import overlaps
-from evermap.survival.hazards import PiecewiseConstantHazard, scale_hazard
-from evermap.survival.logmath import log_sum_exp
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.survival.base import LifetimePrior
+from evermap.survival.hazard_grid import (
+    COMMON,
+    HazardScale,
+    count_draws,
+    draw_normals,
+    find_shares,
+    make_scales,
+    weigh_draws,
+)
+from evermap.survival.hazard_posterior import HazardPosterior, integrate_expected
+from evermap.survival.logmath import TINY, log_sum_exp
+from evermap.survival.stay_likelihood import StayAges, StayLikelihood
+from evermap.types import FloatArray, IntArray
 
 EDGES_S = np.concatenate([[0.0], np.geomspace(1.0, 1e9, 37)])
 """Stretches of constant hazard: four to a factor of ten."""
-SLOW = 4.0
-"""Length of the slow process over age, in natural logarithms above an hour."""
-HOUR_S = 3600.0
-YOUNG = 4.0
-"""Factor of the distances of ages below an hour, for the slow process: short stops tell little of what is parked."""
-SLOW_SCALE, COMMON = 2.8, (0.3, 0.8)
-"""Standard deviation of log hazards (of the rates of the general-purpose prior, an hour to ten years: 3.3), and the
-share of their variance that classes have in common."""
-FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
-"""Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
 LEAST_STRETCHES = 14
 """Stretches between the ages of the first and the last ends that were seen."""
-DRAWS, LEAST_DRAWS, NEGLIGIBLE = 256, 32, 5e-3
-"""Draws for the most probable member of the grid, half of them mirror images of the other half, and for others in
-proportion to their probability, but so many; and the probability below which there are none."""
 LEAST_SURVIVAL, TRUSTED = 1e-9, 0.02
 """Survival down to which the expected one is that of the usual prior, and of a stated one: what is left of a stated
 hazard later is its ratio to the expected one, the less, the more was seen at that age."""
@@ -58,330 +51,9 @@ FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
 """Standard deviations at which exact densities are computed, and those between; the two which tell whether to."""
 STRAIGHT, HEAVIEST = 0.1, 16.0
 """Difference of log densities there up to which the normal one is kept; and the largest weight, in mean ones."""
-ALIKE = 2
-"""Digits after the first to which stays are alike that are learned from together."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
-NEGLECTED = 1e-6
-"""Share of the largest variance below which a direction of the process is dropped."""
-_TINY = 1e-300
 _EXACT = 1e-12
 """Relative error of a stated hazard."""
-
-
-@dataclass(frozen=True, slots=True)
-class StayAges:
-    """N stays by their ages at looks, each with J equally probable instants of arrival.
-
-    Attributes:
-        first_s, last_s, gone_s: (N, J) ages at the first and the last sighting, and at the look that missed it; inf
-            where it goes on.
-        weight: (N,) how many each stands for.
-        group: (N,) class of each.
-        gap_s: (N, 2) two lengths of the gaps between looks from first to last, half of them have each; of one gap where
-            nothing can return unseen.
-        back: (N,) probability that one that leaves is back after one more stay elsewhere.
-        back_rate: (N,) rate in 1/s at which others return.
-    """
-
-    first_s: FloatArray
-    last_s: FloatArray
-    gone_s: FloatArray
-    weight: FloatArray
-    group: IntArray
-    gap_s: FloatArray
-    back: FloatArray
-    back_rate: FloatArray
-
-    @classmethod
-    def of_samples(cls, data: CensoredLifetimes, group: IntArray | None = None) -> Self:
-        """Take censored samples (N rows): entry, left and right bounds of one instant each; ends that were observed
-        lie in a span of a billionth of their age.
-        """
-        last = np.maximum(data.left_s, data.entry_s)
-        gone = np.where(data.exact, data.right_s * (1.0 + 1e-9), data.right_s)
-        n = len(last)
-        return cls(
-            data.entry_s[:, None], last[:, None], gone[:, None], data.weight,
-            np.zeros(n, dtype=np.int64) if group is None else group,
-            np.ones((n, 2)), np.zeros(n), np.zeros(n),
-        )  # fmt: skip
-
-    @classmethod
-    def empty(cls) -> Self:
-        """Return no stays."""
-        ages, column = np.zeros((0, 1)), np.zeros(0)
-        return cls(ages, ages, ages, column, np.zeros(0, dtype=np.int64), np.zeros((0, 2)), column, column)
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """Return all that have a weight; rows that are alike to three digits are one."""
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__}
-        weight = columns.pop("weight")
-        some = weight > 0.0
-        if not some.any():
-            return cls.empty()
-        table = np.column_stack([*columns.values()])[some]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            size = 10.0 ** (np.floor(np.log10(np.abs(table))) - ALIKE)
-            alike = np.where(np.isfinite(size) & (size > 0.0), np.rint(table / size) * size, table)
-        _, first, row = np.unique(alike, axis=0, return_index=True, return_inverse=True)
-        kept = {name: column[some][first] for name, column in columns.items()}
-        return cls(weight=np.bincount(row.ravel(), weight[some]).astype(np.float64), **kept)
-
-    def of_group(self, group: int) -> Self:
-        """Return those of one class."""
-        mine = self.group == group
-        return type(self)(*(getattr(self, name)[mine] for name in self.__slots__))
-
-    @property
-    def ended(self) -> BoolArray:
-        """(N,) whether it is known to be gone."""
-        return np.isfinite(self.gone_s[:, 0])
-
-
-class _Likelihood:
-    """Log likelihood of the stays of one class, as a function of the hazards (K,) of the stretches."""
-
-    def __init__(self, stays: StayAges, edges_s: FloatArray) -> None:
-        n, j = stays.first_s.shape
-        self.stays, self.ended = stays, stays.ended
-        last, gone = stays.last_s, np.where(np.isfinite(stays.gone_s), stays.gone_s, stays.last_s)
-        spans = ((np.zeros_like(last), stays.first_s), (stays.first_s, last), (last, gone))
-        self.spent = [overlaps(a.ravel(), b.ravel(), edges_s).reshape(n, j, len(edges_s)) for a, b in spans]
-        both = stays.gap_s.sum(axis=1)
-        self.watched_s = last[:, 0] - stays.first_s[:, 0]
-        self.left_s = (gone - last)[:, 0]
-        self.pairs = np.maximum(self.watched_s / both, 0.5)
-        self.share = stays.gap_s / both[:, None]
-
-    def values(self, hazards: FloatArray) -> FloatArray:
-        """Return the values (S,) of hazards (S, K)."""
-        stays = self.stays
-        until, stayed, left = (spent @ hazards.T for spent in self.spent)  # (N, J, S)
-        score = -until
-        for part in (0, 1):
-            each = (self.share[:, part] / self.pairs)[:, None, None]
-            come = (stays.back_rate * self.watched_s)[:, None, None] * each
-            score += self.pairs[:, None, None] * _log_there_again(stayed * each, stays.back[:, None, None], come)
-        come = (stays.back_rate * self.left_s)[self.ended, None, None]
-        score[self.ended] += _log_gone(left[self.ended], stays.back[self.ended, None, None], come)
-        seen, there = (log_sum_exp(np.moveaxis(part, 1, -1)) for part in (score, -until))
-        return np.asarray(stays.weight @ (seen - there))
-
-    def __call__(self, hazard: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return the value, and gradient (K,) and second derivative (K, K) by log hazards."""
-        value, gradients, curvatures = self.by_class(hazard[None], np.zeros(len(self.stays.weight), dtype=np.int64))
-        return value, gradients[0], curvatures[0]
-
-    def by_class(self, hazards: FloatArray, row: IntArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return the value under hazards (C, K), of which each stay has one (N,), in order; and gradients (C, K) and
-        second derivatives (C, K, K) by log hazards.
-        """
-        stays, ended = self.stays, self.ended
-        before, during, after = (spent * hazards[row, None] for spent in self.spent)
-        until, stayed, left = (part.sum(axis=-1) for part in (before, during, after))
-        score, first, second = -until, np.zeros_like(until), np.zeros_like(until)
-        for part in (0, 1):
-            each = (self.share[:, part] / self.pairs)[:, None]
-            value, d1, d2 = _there_again(
-                stayed * each, stays.back[:, None], (stays.back_rate * self.watched_s)[:, None] * each
-            )
-            score = score + self.pairs[:, None] * value
-            first += self.pairs[:, None] * each * d1
-            second += self.pairs[:, None] * each**2 * d2
-        value, of_end, of_end_2 = _gone(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
-        score = score + np.where(ended[:, None], value, 0.0)
-        of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
-        seen, there = log_sum_exp(score), log_sum_exp(-until)
-        total = float(stays.weight @ (seen - there))
-        w = stays.weight[:, None]
-        p, q = w * np.exp(score - seen[:, None]), w * np.exp(-until - there[:, None])
-        slope = -before + first[..., None] * during + of_end[..., None] * after
-        mean, mean_before = (slope * p[..., None]).sum(axis=1), (before * q[..., None]).sum(axis=1)
-        columns, weights = [during, after], [p * second, p * of_end_2]
-        if slope.shape[1] > 1:  # of one instant these are 0 in sum
-            per = 1.0 / w
-            columns += [slope, mean[:, None], mean_before[:, None], before]
-            weights += [p, -per, per, -q]
-        of_all, by = np.concatenate(columns, axis=1), np.concatenate(weights, axis=1)
-        n_classes, n_stretches = hazards.shape
-        gradients, curvatures = np.zeros((n_classes, n_stretches)), np.zeros((n_classes, n_stretches, n_stretches))
-        ends = np.searchsorted(row, np.arange(n_classes + 1))
-        for k, (low, high) in enumerate(pairwise(ends.tolist())):
-            gradients[k] = (mean[low:high] + mean_before[low:high]).sum(axis=0)
-            curvatures[k] = _outer(of_all[low:high], by[low:high])
-            curvatures[k].flat[:: n_stretches + 1] += gradients[k]
-        return total, gradients, curvatures
-
-
-def _outer(columns: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the weighted sum (K, K) of outer products of rows (N, J, K)."""
-    flat = columns.reshape(-1, columns.shape[-1])
-    return np.asarray((flat * weight.reshape(-1, 1)).T @ flat)
-
-
-def _log_there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> FloatArray:
-    """Return the log probability to be there at the next look, by the integrated hazard of leaving.
-
-    `log (c + l exp(-c - l)) / (c + l)` with `c = back l + come` (`maps.learning`); `-l` where nothing comes back.
-    """
-    leave = np.maximum(leave, _TINY)
-    coming = back * leave + come
-    both = coming + leave
-    with np.errstate(all="ignore"):
-        value = np.log((coming + leave * np.exp(-both)) / both)
-    value = np.where(both < 1e-4, -leave + 0.5 * leave * (both - leave), value)
-    return np.where((back == 0.0) & (come == 0.0), -leave, value)
-
-
-def _there_again(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return `_log_there_again`, and its derivatives by the integrated hazard."""
-    plain = (back == 0.0) & (come == 0.0)
-    value = _log_there_again(leave, back, come)
-    leave = np.maximum(leave, _TINY)
-    coming = back * leave + come
-    both = coming + leave
-    small = both < 1e-4
-    with np.errstate(all="ignore"):
-        gone = np.exp(-both)
-        top = coming + leave * gone
-        rise = back + gone * (1.0 - (1.0 + back) * leave)
-        bend = -gone * (1.0 + back) * (2.0 - (1.0 + back) * leave)
-        d1 = rise / top - (1.0 + back) / both
-        d2 = bend / top - (rise / top) ** 2 + ((1.0 + back) / both) ** 2
-    d1 = np.where(small, -1.0 - leave + 0.5 * (both + leave * (1.0 + back)), d1)
-    d2 = np.where(small, back, d2)
-    return value, np.where(plain, -1.0, d1), np.where(plain, 0.0, d2)
-
-
-def _log_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> FloatArray:
-    """Return the log probability to be gone at the next look, by the integrated hazard of leaving."""
-    leave = np.maximum(leave, _TINY)
-    change = (1.0 + back) * leave + come
-    with np.errstate(all="ignore"):
-        return np.log(leave / change) + np.log(-np.expm1(-change))
-
-
-def _gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return `_log_gone`, and its derivatives by the integrated hazard."""
-    value = _log_gone(leave, back, come)
-    leave = np.maximum(leave, _TINY)
-    change = (1.0 + back) * leave + come
-    with np.errstate(all="ignore"):
-        odds = 1.0 / np.expm1(np.minimum(change, 700.0))
-        d1 = 1.0 / leave - (1.0 + back) / change + (1.0 + back) * odds
-        d2 = -1.0 / leave**2 + ((1.0 + back) / change) ** 2 - (1.0 + back) ** 2 * odds * (1.0 + odds)
-    return value, d1, d2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scale:
-    """One member of the grid.
-
-    Attributes:
-        columns: (K, R) that make log hazards, relative to the stated one, of R independent standard normal numbers.
-        common: share of their variance that all classes have in common.
-        p: prior probability of this member.
-    """
-
-    columns: FloatArray
-    common: float
-    p: float
-
-
-@lru_cache(maxsize=16)
-def _scales(edges: tuple[float, ...]) -> tuple[_Scale, ...]:
-    edges_s = np.asarray(edges)
-    ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
-    age = np.log(np.sqrt(np.maximum(edges_s, 0.25 * ends_s) * ends_s) / HOUR_S)
-    where = np.where(age < 0.0, YOUNG * age, age)
-    found = []
-    for length, fast, p in FAST:
-        values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + fast**2 * _matern(age, length))
-        kept = values > NEGLECTED * values[-1]
-        columns = vectors[:, kept] * np.sqrt(values[kept])
-        found += [_Scale(columns, common, p / len(COMMON)) for common in COMMON]
-    return tuple(found)
-
-
-def _matern(where: FloatArray, length: float) -> FloatArray:
-    """Return the Matern kernel of smoothness 3/2."""
-    far = np.sqrt(3.0) * np.abs(where[:, None] - where) / length
-    return np.asarray((1.0 + far) * np.exp(-far))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HazardPosterior(SurvivalEstimate):
-    """Posterior of the hazard of one class, as weighted draws.
-
-    Attributes:
-        edges_s: (K,) starts of the stretches in seconds, the first 0; the last hazard holds for ever.
-        rates: (S, K) hazards in 1/s.
-        weight: (S,) of sum 1.
-        said: the lifetime that a user stated; None where nothing was stated.
-        before: (K,) log of the ratio of the stated hazard to the one expected without any stay; 0 where `said` is
-            None, and wherever not nearly all are gone.
-        risk: (K,) number of stays that were at risk in each stretch, as far as they spent time there.
-    """
-
-    edges_s: FloatArray
-    rates: FloatArray
-    weight: FloatArray
-    said: LifetimePrior | None
-    before: FloatArray
-    risk: FloatArray
-
-    @property
-    def seen_s(self) -> tuple[float, float]:
-        """Return the ages between which stays were at risk; below and above, the prior holds. (inf, 0) for none."""
-        seen = np.flatnonzero(self.risk > 0.0)
-        if not len(seen):
-            return np.inf, 0.0
-        low, high = int(seen[0]), int(seen[-1])
-        ends_s = np.append(self.edges_s[1:], np.inf)
-        return float(self.edges_s[low]), float(ends_s[high])
-
-    def survival(self, t: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the expected `P(T > t)`, and its pointwise lower and upper credible bounds.
-
-        Raises:
-            ConfigError: `confidence` is not in (0, 1), or an invalid time.
-        """
-        check_open_share(confidence)
-        times = check_times(t)
-        alive = np.exp(-overlaps(np.zeros(times.size), times.ravel(), self.edges_s) @ self.rates.T)
-        order = np.argsort(alive, axis=1)
-        below = np.cumsum(self.weight[order], axis=1)
-        tail = 0.5 * (1.0 - confidence)
-        rows = np.arange(len(alive))
-        lower, upper = (
-            alive[rows, order[rows, np.minimum((below < share).sum(axis=1), alive.shape[1] - 1)]]
-            for share in (tail, 1.0 - tail)
-        )
-        found = (alive @ self.weight, lower, upper)
-        mean, lower, upper = (np.asarray(values.reshape(times.shape))[()] for values in found)
-        return mean, lower, upper
-
-    def prior(self) -> LifetimePrior:
-        """Return the lifetime whose survival is the expected one at every edge; what was stated keeps its form."""
-        integrated = _integrate_expected(self.rates, self.weight, self.edges_s)
-        ends_s = np.append(self.edges_s[1:], 2.0 * self.edges_s[-1])
-        if self.said is None:
-            return PiecewiseConstantHazard(tuple(self.edges_s), tuple(integrated / (ends_s - self.edges_s)))
-        said = 0.0 - np.asarray(self.said.log_conditional_survival(self.edges_s, ends_s))
-        known = (said > 0.0) & np.isfinite(said) & (integrated > 0.0)
-        factors = np.where(known, integrated / np.where(known, said, 1.0), 1.0) * np.exp(self.before)
-        if np.abs(factors - 1.0).max() < 1e-10:
-            return self.said
-        return scale_hazard(self.said, tuple(self.edges_s.tolist()), tuple(factors.tolist()))
-
-
-def _integrate_expected(rates: FloatArray, weight: FloatArray, edges_s: FloatArray) -> FloatArray:
-    """Return integrals (K,) over the stretches of the hazard of the expected survival."""
-    steps = np.diff(np.append(edges_s, 2.0 * edges_s[-1]))
-    cumulative = np.concatenate([np.zeros((len(rates), 1)), np.cumsum(rates * steps, axis=1)], axis=1)
-    log_expected = log_sum_exp((np.log(np.maximum(weight, _TINY))[:, None] - cumulative).T)
-    return np.asarray(np.maximum(-np.diff(log_expected), 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -469,18 +141,18 @@ def _learn(evidence: _Evidence) -> list[HazardPosterior]:
     stays, said, edges_s = evidence.stays, evidence.said, evidence.edges_s
     edges = tuple(edges_s.tolist())
     free = [row for row, one in enumerate(said) if one is None]
-    likelihoods = [_Likelihood(stays.of_group(row), edges_s) for row in range(len(said))]
+    likelihoods = [StayLikelihood(stays.of_group(row), edges_s) for row in range(len(said))]
     risk = [_at_risk(one) for one in likelihoods]
     found: list[HazardPosterior] = [None] * (len(said) + 1)  # type: ignore[list-item]
-    base, scales = _usual_base(evidence.usual, edges), _scales(edges)
+    base, scales = _usual_base(evidence.usual, edges), make_scales(edges)
     together = _Together.of([likelihoods[row] for row in free], stays, free, edges_s)
     modes = list[_Mode]()
     for scale in scales:
         near = modes[-1] if modes and modes[-1].scale.columns is scale.columns else modes[0] if modes else None
         modes.append(together.mode(scale, base, near))
-    counts = _draw_counts(_shares(scales, [mode.evidence for mode in modes]))
+    counts = count_draws(find_shares(scales, [mode.evidence for mode in modes]))
     drawn = [(mode, together.draw(mode, base, n)) for mode, n in zip(modes, counts, strict=True) if n]
-    share = _shares([mode.scale for mode, _ in drawn], [mode.evidence + each.gain for mode, each in drawn])
+    share = find_shares([mode.scale for mode, _ in drawn], [mode.evidence + each.gain for mode, each in drawn])
     for at, row in enumerate([*free, len(said)]):
         rates = base * np.exp(np.concatenate([each.v[at] for _, each in drawn]))
         weight = np.concatenate([p * each.weight[at] for p, (_, each) in zip(share, drawn, strict=True)])
@@ -492,37 +164,10 @@ def _learn(evidence: _Evidence) -> list[HazardPosterior]:
     return found
 
 
-def _shares(scales: Sequence[_Scale], log_evidence: ArrayLike) -> FloatArray:
-    """(M,) probabilities of members of the grid."""
-    log_p = np.log([scale.p for scale in scales]) + np.asarray(log_evidence)
-    weight = np.exp(log_p - log_p.max())
-    return np.asarray(weight / weight.sum())
-
-
-def _draw_counts(share: FloatArray) -> list[int]:
-    """Return how many draws each member of the grid has, by their probabilities (M,)."""
-    counts = np.maximum(2.0 * np.ceil(0.5 * DRAWS * share / share.max()), LEAST_DRAWS)
-    return [int(count) for count in np.where(share < NEGLIGIBLE, 0.0, counts)]
-
-
-def _draw_weights(scales: Sequence[_Scale], log_evidence: Sequence[float] | None = None) -> FloatArray:
-    """(S,) of the draws of all members of the grid, before any data where no evidence is given."""
-    share = _shares(scales, np.zeros(len(scales)) if log_evidence is None else log_evidence)
-    return np.repeat(share / DRAWS, DRAWS)
-
-
-def _at_risk(likelihood: _Likelihood) -> FloatArray:
+def _at_risk(likelihood: StayLikelihood) -> FloatArray:
     """(K,) stays that were at risk in each stretch, between first sighting and the last bound."""
     during, after = (spent[:, 0] for spent in likelihood.spent[1:])
     return np.asarray(likelihood.stays.weight @ ((during + after) > 0.0))
-
-
-@lru_cache(maxsize=64)
-def _normals(r: int, n: int = DRAWS) -> tuple[FloatArray, FloatArray]:
-    """Return standard normal draws (N, R) twice, the same for all, each with its mirror image."""
-    rng = np.random.default_rng(0)
-    one, other = (rng.standard_normal((n // 2, r)) for _ in range(2))
-    return np.concatenate([one, -one]), np.concatenate([other, -other])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -537,7 +182,7 @@ class _Mode:
         evidence: log evidence of the member, by a normal posterior.
     """
 
-    scale: _Scale
+    scale: HazardScale
     shared: FloatArray
     own: FloatArray
     slopes: FloatArray
@@ -574,18 +219,18 @@ class _Together:
         row: (N,) class of each of these.
     """
 
-    each: list[_Likelihood]
-    every: _Likelihood
+    each: list[StayLikelihood]
+    every: StayLikelihood
     row: IntArray
 
     @classmethod
-    def of(cls, each: list[_Likelihood], stays: StayAges, classes: list[int], edges_s: FloatArray) -> Self:
+    def of(cls, each: list[StayLikelihood], stays: StayAges, classes: list[int], edges_s: FloatArray) -> Self:
         order = np.argsort(stays.group, kind="stable")
         order = order[np.isin(stays.group[order], classes)]
         mine = StayAges(*(getattr(stays, name)[order] for name in StayAges.__slots__))
-        return cls(each, _Likelihood(mine, edges_s), np.searchsorted(classes, mine.group))
+        return cls(each, StayLikelihood(mine, edges_s), np.searchsorted(classes, mine.group))
 
-    def mode(self, scale: _Scale, base: FloatArray, near: _Mode | None = None) -> _Mode:
+    def mode(self, scale: HazardScale, base: FloatArray, near: _Mode | None = None) -> _Mode:
         """Return the most probable numbers, by Newton's method from those of another member, else from none."""
         columns, n, r = scale.columns, len(self.each), scale.columns.shape[1]
         of_shared, of_own = 1.0 / scale.common, 1.0 / (1.0 - scale.common)
@@ -634,7 +279,7 @@ class _Together:
         """Return draws about the most probable numbers."""
         scale, columns, n = mode.scale, mode.scale.columns, len(self.each)
         of_shared, of_own = 1.0 / scale.common, 1.0 / (1.0 - scale.common)
-        one, other = _normals(columns.shape[1], count)
+        one, other = draw_normals(columns.shape[1], count)
         common = one @ _root(mode.of_shared)
         draws, weights, moved, gain = [], [], np.zeros_like(common), 0.0
         for row, covariance in enumerate(mode.inverse):
@@ -666,7 +311,7 @@ class _Line:
         value: log likelihood there.
     """
 
-    likelihood: _Likelihood
+    likelihood: StayLikelihood
     base: FloatArray
     columns: FloatArray
     mode: FloatArray
@@ -681,7 +326,7 @@ class _Line:
             values = self.likelihood.values(hazards.reshape(-1, len(self.base))).reshape(deviations.shape[:-1])
             bend = 0.5 * ((deviations @ self.information) * deviations).sum(axis=-1)
             found = values - self.value - deviations @ self.slope + bend
-        return np.asarray(np.where(np.isfinite(found), found, -1.0 / _TINY))
+        return np.asarray(np.where(np.isfinite(found), found, -1.0 / TINY))
 
     def draw(self, spread: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return deviations (S, R) from the mode, their weights (S,), and the log evidence gained over normal ones.
@@ -736,31 +381,31 @@ def _root(covariance: Any) -> FloatArray:
 
 
 def _fit_stated(
-    likelihood: _Likelihood, said: Statement, edges: tuple[float, ...], risk: FloatArray
+    likelihood: StayLikelihood, said: Statement, edges: tuple[float, ...], risk: FloatArray
 ) -> HazardPosterior:
     """Return the posterior of a class of which a user states a lifetime."""
     edges_s = np.asarray(edges)
     ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
     alive = np.exp(np.asarray(said.prior.log_survival(np.append(edges_s, ends_s[-1]))))
     ends = said.worth * np.maximum(alive[:-1] - alive[1:], 0.0)
-    scales = [scale for scale in _scales(edges) if scale.common == COMMON[0]]  # it leans on no other class
+    scales = [scale for scale in make_scales(edges) if scale.common == COMMON[0]]  # it leans on no other class
     of_scales = []
     for scale in scales:
-        one, _ = _normals(scale.columns.shape[1])
+        one, _ = draw_normals(scale.columns.shape[1])
         root: FloatArray = _root(np.linalg.inv(_precision(scale, ends)))
         of_scales.append(one @ root @ scale.columns.T)
     without = np.concatenate(of_scales)
-    even = _draw_weights(scales)
+    even = weigh_draws(scales)
     base = _match_survival(said.prior, edges_s, without, even, TRUSTED)
-    expected = _integrate_expected(base * np.exp(without), even, edges_s)
+    expected = integrate_expected(base * np.exp(without), even, edges_s)
     base = _not_impossible(base, likelihood, said, edges_s)
     log_evidence, draws = [], []
     for scale in scales:
         evidence, mode, covariance = _fit_alone(likelihood, scale, ends, base)
         log_evidence.append(evidence)
-        one, _ = _normals(len(mode))
+        one, _ = draw_normals(len(mode))
         draws.append((mode + one @ _root(covariance)) @ scale.columns.T)
-    v, weight = np.concatenate(draws), _draw_weights(scales, log_evidence)
+    v, weight = np.concatenate(draws), weigh_draws(scales, log_evidence)
     kept = weight @ np.square(v - weight @ v) / (even @ np.square(without - even @ without))
     stated = 0.0 - np.asarray(said.prior.log_conditional_survival(edges_s, ends_s))
     known = (stated > 0.0) & np.isfinite(stated) & (expected > 0.0)
@@ -768,13 +413,13 @@ def _fit_stated(
     return HazardPosterior(edges_s, base * np.exp(v), weight, said.prior, before, risk)
 
 
-def _precision(scale: _Scale, ends: FloatArray) -> FloatArray:
+def _precision(scale: HazardScale, ends: FloatArray) -> FloatArray:
     """Return the information (R, R) of the process and of ends (K,) in the stretches."""
     return np.asarray(np.eye(scale.columns.shape[1]) + (scale.columns.T * ends) @ scale.columns)
 
 
 def _fit_alone(
-    likelihood: _Likelihood, scale: _Scale, ends: FloatArray, base: FloatArray
+    likelihood: StayLikelihood, scale: HazardScale, ends: FloatArray, base: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return log evidence, mode (R,) and covariance of one class with pseudo-ends at the stated hazard."""
     columns = scale.columns
@@ -810,7 +455,7 @@ def _fit_alone(
     return evidence, z, np.asarray(np.linalg.inv(hessian), dtype=np.float64)
 
 
-def _not_impossible(base: FloatArray, likelihood: _Likelihood, said: Statement, edges_s: FloatArray) -> FloatArray:
+def _not_impossible(base: FloatArray, likelihood: StayLikelihood, said: Statement, edges_s: FloatArray) -> FloatArray:
     """Return hazards under which every end that was seen is possible.
 
     A hazard of zero, worth w stays, is one of which w stays have seen no end: one in w in a factor e of age.
@@ -826,10 +471,10 @@ def _not_impossible(base: FloatArray, likelihood: _Likelihood, said: Statement, 
 
 def _usual_base(usual: LifetimePrior, edges: tuple[float, ...]) -> FloatArray:
     """Return hazards (K,) such that draws as those of a class without stays have the usual expected survival."""
-    scales, draws, weights = _scales(edges), [], []
-    share = _shares(scales, np.zeros(len(scales)))
-    for scale, p, n in zip(scales, share.tolist(), _draw_counts(share), strict=True):
-        one, other = _normals(scale.columns.shape[1], n)
+    scales, draws, weights = make_scales(edges), [], []
+    share = find_shares(scales, np.zeros(len(scales)))
+    for scale, p, n in zip(scales, share.tolist(), count_draws(share), strict=True):
+        one, other = draw_normals(scale.columns.shape[1], n)
         numbers = np.sqrt(scale.common) * one + np.sqrt(1.0 - scale.common) * other
         draws.append(numbers @ scale.columns.T)
         weights.append(np.full(n, p / n))
@@ -863,12 +508,12 @@ def _match_survival(
         for _ in range(100):  # log expected survival falls with the level
             gone = np.exp(level) * rise
             left = float(p @ np.exp(-gone))
-            error = np.log(max(left, _TINY)) - wanted[k]
-            slope = float(p @ (gone * np.exp(-gone))) / max(left, _TINY)
+            error = np.log(max(left, TINY)) - wanted[k]
+            slope = float(p @ (gone * np.exp(-gone))) / max(left, TINY)
             if abs(error) < _EXACT * slope:
                 break
             low, high = (level, high) if error > 0.0 else (low, level)
-            step = error / max(slope, _TINY)
+            step = error / max(slope, TINY)
             level = level + step if low < level + step < high else 0.5 * (low + high)
         base[k] = np.exp(level)
         ratio = base[k] / plain

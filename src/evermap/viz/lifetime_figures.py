@@ -10,10 +10,10 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.survival.base import LifetimePrior
+from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.nonparametric import KaplanMeier, Npmle
 from evermap.survival.parametric_fit import ParametricFit
-from evermap.survival.pooled_hazards import HazardPosterior
 from evermap.types import FloatArray
 from evermap.viz.style import CLASS_COLOURS, INK, MUTED, class_looks, drawing, legend_name
 from evermap.viz.time_axis import TimeUnit, label_ages, unit_for

@@ -100,6 +100,7 @@ def test_solution_and_covariances_are_those_of_dense_algebra(large, dims, seed, 
         patch.setattr(sparse_system, "LARGE", large)
         solved = world.solved(np.array([shared]))
     assert close(exhausted(solved.solution()), covariance @ right)
+    assert solved.log_determinant == pytest.approx(np.linalg.slogdet(information)[1], rel=1e-9, abs=1e-9)
     spread = exhausted(solved.spread(n_poses - 1))
     for v, (first, last) in enumerate(zip(spread.own_first[:-1], spread.own_first[1:], strict=True)):
         mine = world.numbers([v])

@@ -186,3 +186,30 @@ def test_spreads_of_sizes_are_learned_from_both_kinds_of_pairs() -> None:
     p_same = 1.0 / (1.0 + np.exp(-found.log_odds(pairs)[:, 0]))
     assert (p_same[:n_same] > 0.5).mean() > 0.97
     assert p_same[n_same:].mean() < p_same[:n_same].mean() - 0.3
+
+
+def test_boxes_are_compared_pair_by_pair() -> None:
+    """Two boxes of a session, one of which was seen to come, with two of a map that are wider and turned."""
+    known = lay_boxes([0.0, 5.0], [0.9, 0.3])._replace(
+        class_id=np.array([0, 1]), heading_rad=np.array([0.1, 0.1]), covariance_m2=np.tile(0.03 * np.eye(3), (2, 1, 1)),
+        size_m=np.array([[4.2, 2.0, 1.8], [4.2, np.nan, 1.8]]),
+    )  # fmt: skip
+    seen = replace(
+        see_boxes(known, [0, 1], 0.0), class_id=np.array([0, 0]), heading_rad=np.array([0.3, 0.3 + np.pi]),
+        size_m=np.array([[4.0, 1.6, 1.4], [4.0, 1.6, 1.4]]), covariance_m2=np.tile(0.02 * np.eye(3), (2, 1, 1)),
+        position_m=np.array([[1.05, 0.0, 7.0], [5.0, 0.29, 7.0]]), since_s=np.array([np.nan, 12.0]),
+    )  # fmt: skip
+    pairs = BoxPairs.of(seen, known, np.array([0.0, 0.5]))
+    np.testing.assert_allclose(pairs.off_m, [[[1.05, 0.0], [-3.95, 0.0]], [[5.0, 0.29], [0.0, 0.29]]])
+    np.testing.assert_allclose(pairs.away_m, np.hypot(*np.moveaxis(pairs.off_m, 2, 0)))
+    variance = 0.05 + SETTINGS.drift_m**2
+    for row, more in enumerate((0.0, 0.25)):
+        np.testing.assert_allclose(pairs.spread_m2[row], [(variance + more) * np.eye(2)] * 2)
+    np.testing.assert_allclose(pairs.size_m[0], [[-0.2, -0.4, -0.4], [-0.2, np.nan, -0.4]])
+    np.testing.assert_allclose(pairs.turn_rad, np.full((2, 2), 0.2))  # a box looks the same from behind
+    # over each other: closer than a share of the mean of their widths, 1.08 m; .3 m where one is not known
+    np.testing.assert_array_equal(pairs.over, [[True, False], [False, True]])
+    wider = BoxPairs.of(replace(seen, position_m=seen.position_m + [0.04, 0.02, 0.0]), known, np.zeros(2))
+    np.testing.assert_array_equal(wider.over, np.zeros((2, 2), dtype=np.bool_))
+    np.testing.assert_array_equal(pairs.alike, [[True, False], [True, False]])
+    np.testing.assert_allclose(pairs.p, [[0.9, 0.3], SETTINGS.returns * np.array([0.1, 0.7])])

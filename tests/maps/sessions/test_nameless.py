@@ -23,7 +23,8 @@ from evermap.maps.sessions.nameless import held_at, without_ids
 from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
-from evermap.runs.sessions import enter_session, rename_landmark
+from evermap.runs.edits import rename_landmark
+from evermap.runs.sessions import enter_session
 from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
 from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, rows_of

@@ -11,7 +11,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -214,6 +214,18 @@ def evidence_to_chunks(evidence: Evidence | None) -> list[Chunk]:
         parts.append(Chunk("|u1", _looks_to_bytes(mine)))
         listed.append([int(clique), float(mine.stamp_s.min()), float(mine.stamp_s.max()), parts[-1].name.hex()])
     return [text_chunk(json.dumps(listed)), *parts]
+
+
+def join_by_time(parts: Sequence[Evidence], since_s: float) -> Evidence:
+    """Return evidence joined by time, without what is older.
+
+    Of a long history most parts are one clique's, in order.
+    """
+    every = parts[0].joined(*parts[1:]) if parts else Evidence.empty()
+    if len(every) and (every.stamp_s[0] < since_s or np.any(np.diff(every.stamp_s) < 0.0)):
+        every = every[every.stamp_s >= since_s]
+        every = every[np.argsort(every.stamp_s, kind="stable")]
+    return every
 
 
 def read_index(text: str) -> list[CliqueLooks]:

@@ -23,8 +23,9 @@ from sqlalchemy.exc import ArgumentError, DisconnectionError, NoSuchModuleError
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from evermap.errors import ConfigError, InputError, MissingExtraError
+from evermap.maps.store.anchor import CHANNEL
 from evermap.maps.store.protocol import DamagedMapError
-from evermap.maps.store.sql import CHANNEL, SqlStore
+from evermap.maps.store.sql import SqlStore
 
 SITE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
 """Names of sites, which are parts of the names of database schemas (63 bytes) and files."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Engine, bindparam, delete, func, insert, inspect, select, update
+from sqlalchemy import Connection, Engine, bindparam, func, insert, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
 from sqlalchemy.schema import CreateSchema
 
@@ -21,10 +20,13 @@ from evermap.existence.sites import Evidence
 from evermap.maps.diff import grown
 from evermap.maps.living import LivingMap, Members
 from evermap.maps.store import content, schema
+from evermap.maps.store.anchor import STORE_COLUMNS, list_pruned, move_anchor, now_utc, read_anchor, read_schema_version
+from evermap.maps.store.chain import RecordChain
+from evermap.maps.store.chunk_table import LENGTH, delete_chunks, fetch_chunks, in_batches, list_packs, replace_chunks
 from evermap.maps.store.content import Chunk, DamagedError, deflate, inflate, is_chunk
-from evermap.maps.store.history import STORY, Record, about, lineage, pruned_to_text, ranges, read_pruned
-from evermap.maps.store.measured import evidence_to_chunks, looks_of, read_index
-from evermap.maps.store.packs import MEMBER_BYTES, PACK_BYTES, make_pack, open_members, place_of
+from evermap.maps.store.history import STORY, Record, about, ranges
+from evermap.maps.store.measured import evidence_to_chunks, join_by_time, looks_of, read_index
+from evermap.maps.store.packs import PACK_BYTES, make_pack
 from evermap.maps.store.protocol import (
     Attachment,
     DamagedMapError,
@@ -44,15 +46,10 @@ from evermap.types import ChangeKind, MapChange
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CHANNEL = "evermap"
-"""On which commits are announced."""
 _MOST_CHECKED = 2_000
 """Names of checked chunks that are remembered, a few times those of one map."""
-_AT_ONCE = 500
-"""Names in one question to the database."""
 _PACKED_AT_ONCE = 64
 """The same when packing: some 10 MB."""
-_LENGTH = func.length(schema.chunk.c.data)
 _LONGEST = 900_000_000
 """Bytes of an attachment; a database takes no more in one piece."""
 
@@ -82,22 +79,21 @@ class SqlStore(Shown, MapStore):
     ) -> None:
         self.where = where
         self._engine, self._explain, self._tidy = engine, explain, tidy
-        self._records: dict[bytes, Record] = {}  # they never change, and their names are their checksums
-        self._history: tuple[Any, int, dict[int, Record], dict[int, bytes | None]] | None = None  # of `_chain`
+        self._chain = RecordChain(where)
         self._checked: set[bytes] = set()  # chunks that this object has read, and found to be what was written
         with self._transaction() as connection:
-            version = self._schema_version(connection)
+            version = read_schema_version(connection, where)
         if version == 0 and not create:
             raise InputError("contains no map", path=where, hint="evermap slam INPUT --map FILE writes one")
         if version < schema.SCHEMA_VERSION:
             with self._transaction(writes=True) as connection:
-                version = self._schema_version(connection)  # somebody may have been faster
+                version = read_schema_version(connection, where)  # somebody may have been faster
                 if version == 0:
                     if own := engine.get_execution_options().get("schema"):
                         connection.execute(CreateSchema(own, if_not_exists=True))
                     schema.metadata.create_all(connection)
                     values = (schema.SCHEMA_VERSION, now_utc(), __version__, 0, None)
-                    row = dict(zip(_STORE_COLUMNS, values, strict=True)) | {"checksum": schema.checksum(*values)}
+                    row = dict(zip(STORE_COLUMNS, values, strict=True)) | {"checksum": schema.checksum(*values)}
                     connection.execute(insert(schema.store).values(row))
                 elif version < schema.SCHEMA_VERSION:
                     migrate(connection, version)
@@ -135,37 +131,37 @@ class SqlStore(Shown, MapStore):
 
     def head(self) -> int:
         with self._transaction() as connection:
-            return self._anchor(connection)[0]
+            return read_anchor(connection)[0]
 
     def log(self) -> tuple[Revision, ...]:
         with self._transaction() as connection:
-            records = self._chain(connection)[0]
-            stored = self._fetched(connection, {record.config for record in records.values()})
+            records = self._chain.read(connection)[0]
+            stored = fetch_chunks(connection, {record.config for record in records.values()})
             configs = {name: content.read_text(name, data) for name, data in stored.items()}
             return tuple(record.revision(configs[record.config]) for _, record in sorted(records.items()))
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
         with self._transaction() as connection:
-            return self._lineage(connection, revision)
+            return self._chain.find_lineage(connection, revision)
 
     def load(self, revision: int | None = None) -> LivingMap:
         with self._transaction() as connection:
-            number = self._known(connection, revision)
+            number = self._chain.find_number(connection, revision)
             if number == 0:
                 return LivingMap()
-            record = self._record(connection, number)
-            pruned = self._pruned(connection)
+            record = self._chain.record_of(connection, number)
+            pruned = list_pruned(connection)
             if number in pruned:
-                raise self._gone(number, pruned[number], self._chain(connection)[0].keys() - pruned.keys())
+                raise self._gone(number, pruned[number], self._chain.read(connection)[0].keys() - pruned.keys())
             return self._unpacked(connection, record)
 
     def members(self, revision: int | None = None) -> Members:
         with self._transaction() as connection:
-            number = self._known(connection, revision)
+            number = self._chain.find_number(connection, revision)
             if number == 0:
                 return LivingMap().members
             names = [item.name for item in fields(Members)]
-            return Members(*self._columns(connection, self._record(connection, number), *names))
+            return Members(*self._columns(connection, self._chain.record_of(connection, number), *names))
 
     def commit(
         self,
@@ -204,7 +200,7 @@ class SqlStore(Shown, MapStore):
         )
         stored = {key: chunk.stored() for key, chunk in chunks.items() if key not in self._checked}
         with self._transaction(writes=True) as connection:
-            head, before = self._anchor(connection)
+            head, before = read_anchor(connection)
             if head != parent:
                 problem = f"revision {head} was committed after revision {parent} was read; nothing was written"
                 hint = "run it again, which continues from the newest"
@@ -222,17 +218,17 @@ class SqlStore(Shown, MapStore):
             ).chunk()
             chunks[record.name] = record
             self._put(connection, chunks, {**stored, record.name: record.stored()})
-            self._fetched(connection, {key for key, _ in attached.values()} - chunks.keys())  # those that are shared
+            fetch_chunks(connection, {key for key, _ in attached.values()} - chunks.keys())  # those that are shared
             connection.execute(insert(schema.revision).values(number=number, record=record.name))
-            self._move_anchor(connection, number, record.name)
+            move_anchor(connection, number, record.name)
         self._remember(chunks.keys())
         return number
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
         with self._transaction() as connection:
-            head = self._known(connection, None)
-            number = self._known(connection, revision)
-            next_ids = self._record(connection, head).next_ids if head else (0, 0)
+            head = self._chain.find_number(connection, None)
+            number = self._chain.find_number(connection, revision)
+            next_ids = self._chain.record_of(connection, head).next_ids if head else (0, 0)
         old = self.load(number)
         if number == head:
             raise InputError(f"revision {number} is the newest already", path=self.where, hint="an older one")
@@ -263,21 +259,21 @@ class SqlStore(Shown, MapStore):
         if keep < 1:
             raise ConfigError(f"{keep} is less than 1", field="keep", hint="1 keeps the newest revision only")
         with self._transaction(writes=not dry_run) as connection:
-            records, pruned = self._chain(connection)[0], self._pruned(connection)
-            newest = {*sorted(records)[-keep:], *self._lineage(connection, None)[-keep:]}
+            records, pruned = self._chain.read(connection)[0], list_pruned(connection)
+            newest = {*sorted(records)[-keep:], *self._chain.find_lineage(connection, None)[-keep:]}
             kept = (newest | (records.keys() & {*also})) - pruned.keys()
             old = records.keys() - pruned.keys() - kept
             for number in kept:  # as long as one of them is damaged, an old one may be needed
                 self._unpacked(connection, records[number])
             doomed = self._only_of(connection, records, old, kept)
-            doomed |= {pack for pack, members in self._packs(connection).items() if members <= doomed}
-            n_bytes, size = 0, select(func.sum(_LENGTH))
-            for some in _batches(doomed):
+            doomed |= {pack for pack, members in list_packs(connection).items() if members <= doomed}
+            n_bytes, size = 0, select(func.sum(LENGTH))
+            for some in in_batches(doomed):
                 n_bytes += connection.execute(size.where(schema.chunk.c.name.in_(some))).scalar() or 0
             if not dry_run:
-                self._delete(connection, doomed)
+                delete_chunks(connection, doomed)
             if old and not dry_run:
-                self._move_anchor(connection, *self._anchor(connection), {**pruned, **dict.fromkeys(old, now_utc())})
+                move_anchor(connection, *read_anchor(connection), {**pruned, **dict.fromkeys(old, now_utc())})
         if not dry_run:
             self._checked -= doomed
             self._tidy()  # also what an earlier call was killed before
@@ -285,40 +281,40 @@ class SqlStore(Shown, MapStore):
 
     def compact(self) -> None:
         with self._transaction(writes=True) as connection:
-            head, anchor = self._anchor(connection)
-            before = self._packs(connection)
+            head, anchor = read_anchor(connection)
+            before = list_packs(connection)
             for names in self._alike(connection):
                 some, n_bytes = dict[bytes, bytes](), 0
-                for batch in _batches(names, _PACKED_AT_ONCE):
-                    stored = self._fetched(connection, batch)
+                for batch in in_batches(names, _PACKED_AT_ONCE):
+                    stored = fetch_chunks(connection, batch)
                     for name in batch:
                         if not is_chunk(name, stored[name]):
                             raise DamagedError("a checksum does not match")
                         some[name] = stored[name]
                         n_bytes += len(inflate(stored[name]))
                         if n_bytes >= PACK_BYTES:
-                            self._replace(connection, make_pack(some))
+                            replace_chunks(connection, make_pack(some))
                             some, n_bytes = {}, 0
-                self._replace(connection, make_pack(some))
-            after = self._packs(connection)
-            self._delete(connection, before.keys() - after.keys())
+                replace_chunks(connection, make_pack(some))
+            after = list_packs(connection)
+            delete_chunks(connection, before.keys() - after.keys())
             version = schema.PACKED_VERSION if after else schema.SCHEMA_VERSION
-            self._move_anchor(connection, head, anchor, version=version)
+            move_anchor(connection, head, anchor, version=version)
         self._tidy()  # also what an earlier call was killed before
 
     def _alike(self, connection: Connection) -> Iterator[list[bytes]]:
         """Yield the names of chunks of one kind of all revisions but the newest, oldest first; those of the newest,
         which every session reads, are taken out of their packs. Attachments are compressed already but for stories.
         """
-        fetch = partial(self._fetched, connection)
-        records, pruned = self._chain(connection)[0], self._pruned(connection)
+        fetch = partial(fetch_chunks, connection)
+        records, pruned = self._chain.read(connection)[0], list_pruned(connection)
         if not records:
             return
         rows = connection.execute(select(schema.revision).order_by(schema.revision.c.number))
         names = {row.number: row.record for row in rows if row.number in records}
         newest = max(records)
         apart = {names[newest], *records[newest].chunks(fetch)}
-        self._replace(connection, {name: deflate(data) for name, data in fetch(apart).items()})
+        replace_chunks(connection, {name: deflate(data) for name, data in fetch(apart).items()})
         found: dict[object, dict[bytes, None]] = {"record": dict.fromkeys(names.values())}
         for number, record in sorted(records.items()):
             for kind, parts in record.parts(fetch, content.MEMBERS if number in pruned else "").items():
@@ -329,33 +325,14 @@ class SqlStore(Shown, MapStore):
             yield [name for name in alike if name not in seen]
             seen |= alike.keys()
 
-    def _packs(self, connection: Connection) -> dict[bytes, set[bytes]]:
-        """Names of the packs and of the members of each."""
-        found: dict[bytes, set[bytes]] = {}
-        for name, data in connection.execute(select(schema.chunk).where(_LENGTH == MEMBER_BYTES)):
-            place = place_of(data)
-            if place is not None:
-                found.setdefault(place.pack, set()).add(name)
-        return found
-
-    def _replace(self, connection: Connection, rows: Mapping[bytes, bytes]) -> None:
-        """Store bytes of chunks and packs in the place of those that are there."""
-        self._delete(connection, rows)
-        if rows:
-            connection.execute(insert(schema.chunk), [{"name": name, "data": data} for name, data in rows.items()])
-
-    def _delete(self, connection: Connection, names: Iterable[bytes]) -> None:
-        for some in _batches(names):
-            connection.execute(delete(schema.chunk).where(schema.chunk.c.name.in_(some)))
-
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
         with self._transaction() as connection:
-            number = self._known(connection, revision)
-            return self._record(connection, number).changes if number else ()
+            number = self._chain.find_number(connection, revision)
+            return self._chain.record_of(connection, number).changes if number else ()
 
     def changes_of(self, landmark_id: int | None = None) -> tuple[tuple[int, MapChange], ...]:
         with self._transaction() as connection:
-            records = self._chain(connection)[0]
+            records = self._chain.read(connection)[0]
         told = ((number, change) for number, record in sorted(records.items()) for change in record.changes)
         return tuple((number, change) for number, change in told if landmark_id in (None, *change.landmark_ids))
 
@@ -382,7 +359,7 @@ class SqlStore(Shown, MapStore):
         revisions: Collection[int] | None = None,
     ) -> dict[int, Evidence]:
         with self._transaction() as connection:
-            records = self._records_of(connection, revisions)
+            records = self._chain.records_of(connection, revisions)
             parts: dict[int, list[Evidence]] = {record.number: [] for record in records}
             cliques = dict.fromkeys(parts, clique_id)
             if landmark_id is not None:
@@ -395,30 +372,30 @@ class SqlStore(Shown, MapStore):
                     wanted.setdefault(record.evidence, {}).setdefault(clique, record.number)
             rows = [
                 (wanted[name].get(row.clique_id, wanted[name].get(None, 0)), row)
-                for name, data in self._fetched(connection, wanted).items()
+                for name, data in fetch_chunks(connection, wanted).items()
                 for row in read_index(content.read_text(name, data))
                 if row.last_s >= since_s and not wanted[name].keys().isdisjoint({None, row.clique_id})
             ]
-            stored = self._fetched(connection, {row.name for _, row in rows})
+            stored = fetch_chunks(connection, {row.name for _, row in rows})
             for number, row in rows:
                 parts[number].append(looks_of(row.clique_id, stored[row.name], row.name))
-        return {number: _by_time(some, since_s) for number, some in parts.items()}
+        return {number: join_by_time(some, since_s) for number, some in parts.items()}
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
         with self._transaction() as connection:
-            return tuple(item for record in self._records_of(connection, revisions) for item in record.attached())
+            return tuple(item for record in self._chain.records_of(connection, revisions) for item in record.attached())
 
     def attached(self, attachment: Attachment) -> bytes:
         with self._transaction() as connection:
             name = content.name_of(attachment.digest)
-            return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
+            return Chunk.of_stored(name, "|u1", fetch_chunks(connection, [name])[name]).raw
 
     def named(self, revision: int | None = None) -> tuple[int, str]:
         """Return a revision's number (None for the newest) and its name, a checksum of it and all before it."""
         with self._transaction() as connection:
-            number, name = self._anchor(connection)
+            number, name = read_anchor(connection)
             if revision is not None:
-                number, table = self._known(connection, revision), schema.revision.c
+                number, table = self._chain.find_number(connection, revision), schema.revision.c
                 name = connection.execute(select(table.record).where(table.number == number)).scalar()
             return number, name.hex() if isinstance(name, bytes) else ""
 
@@ -450,7 +427,7 @@ class SqlStore(Shown, MapStore):
             numbers = [{"number": number, "record": records.get(number)} for number in range(1, head + 1)]
             if numbers:
                 connection.execute(insert(schema.revision), numbers)
-            self._move_anchor(connection, head, records.get(head), pruned)
+            move_anchor(connection, head, records.get(head), pruned)
 
     def extend(self, other: SqlStore) -> int:
         """Take over all revisions that another store has after the newest of this one, whole or not at all; returns the
@@ -461,22 +438,22 @@ class SqlStore(Shown, MapStore):
         """
         with other._transaction() as theirs, self._transaction(writes=True) as connection:
             named: dict[int, Any] = {row.number: row.record for row in theirs.execute(select(schema.revision))}
-            (head, anchor), (last, newest) = self._anchor(connection), other._anchor(theirs)
+            (head, anchor), (last, newest) = read_anchor(connection), read_anchor(theirs)
             if named.get(head) != anchor:
                 problem = f"revision {head} is not in {other.where}; nothing was written"
                 raise StaleRevisionError(problem, path=self.where, hint="run it again")
-            fetch, wanted = partial(other._fetched, theirs), {named[number] for number in named if number > head}
-            for number, record in other._chain(theirs, head + 1)[0].items():
+            fetch, wanted = partial(fetch_chunks, theirs), {named[number] for number in named if number > head}
+            for number, record in other._chain.read(theirs, head + 1)[0].items():
                 if number > head:
                     wanted |= record.chunks(fetch)
-            for some in _batches(sorted(wanted)):
+            for some in in_batches(sorted(wanted)):
                 there = connection.execute(select(schema.chunk.c.name).where(schema.chunk.c.name.in_(some))).scalars()
                 rows = [{"name": name, "data": deflate(data)} for name, data in fetch(set(some) - set(there)).items()]
                 if rows:
                     connection.execute(insert(schema.chunk), rows)
             if new := [{"number": number, "record": name} for number, name in sorted(named.items()) if number > head]:
                 connection.execute(insert(schema.revision), new)
-                self._move_anchor(connection, last, newest)
+                move_anchor(connection, last, newest)
         return last
 
     def _n_grown(
@@ -486,7 +463,7 @@ class SqlStore(Shown, MapStore):
         known = np.zeros(0, dtype=np.int64)
         try:
             if parent:
-                (known,) = self._columns(connection, self._record(connection, parent), "landmark_id")
+                (known,) = self._columns(connection, self._chain.record_of(connection, parent), "landmark_id")
         except (DamagedError, InputError):
             return None
         return len(grown(known, living, changes))
@@ -511,9 +488,9 @@ class SqlStore(Shown, MapStore):
         """Store the chunks that are not there yet; one that is there, but damaged, is written anew."""
         column = schema.chunk.c.name
         question = select(column).where(column.in_(bindparam("names", expanding=True)))
-        answers = (connection.execute(question, {"names": some}) for some in _batches(chunks))
+        answers = (connection.execute(question, {"names": some}) for some in in_batches(chunks))
         present = {bytes(row[0]) for answer in answers for row in answer}
-        for key, data in self._fetched(connection, (present - self._checked) & chunks.keys(), missing_ok=True).items():
+        for key, data in fetch_chunks(connection, (present - self._checked) & chunks.keys(), missing_ok=True).items():
             try:
                 Chunk.of_stored(key, chunks[key].dtype, data)
             except DamagedError:
@@ -527,15 +504,11 @@ class SqlStore(Shown, MapStore):
         self, connection: Connection, records: Mapping[int, Record], old: Collection[int], kept: Collection[int]
     ) -> set[bytes]:
         """Names of the chunks that are content of old revisions and nothing else."""
-        fetch = partial(self._fetched, connection)
+        fetch = partial(fetch_chunks, connection)
         found = {name for number in old for name in content.names_in(records[number].content, fetch)}
         for number, record in records.items():
             found -= record.chunks(fetch, "" if number in kept else content.MEMBERS)
         return found
-
-    def _pruned(self, connection: Connection) -> dict[int, str]:
-        """Revisions without content, and since when."""
-        return read_pruned(connection.execute(select(schema.store.c.pruned)).scalar())
 
     def _gone(self, number: int, since: str, kept: Collection[int]) -> PrunedRevisionError:
         utc = since.replace("T", " ").replace("+00:00", " UTC")
@@ -543,91 +516,11 @@ class SqlStore(Shown, MapStore):
         problem = f"the content of revision {number} {gone}; kept: {ranges(kept)}"
         return PrunedRevisionError(problem, path=self.where, hint="one of these, or an older copy of the file")
 
-    def _anchor(self, connection: Connection) -> tuple[int, bytes | None]:
-        """The newest revision, and the name of its record: of these all others are checked."""
-        listed = select(func.max(schema.revision.c.number)).scalar_subquery()
-        rows = connection.execute(select(schema.store, listed)).all()
-        if len(rows) != 1:
-            raise DamagedError(f"{len(rows)} rows say which revision is the newest")
-        *values, newest = rows[0]
-        if not is_anchor(values):
-            raise DamagedError("a checksum does not match: of the row that names the newest revision")
-        if (newest or 0) != values[3]:
-            raise DamagedError(f"the newest revision is {values[3]}, but the last one listed is {newest}")
-        return values[3], values[4]
-
-    def _move_anchor(
-        self,
-        connection: Connection,
-        head: int,
-        record: bytes | None,
-        pruned: Mapping[int, str] | None = None,
-        version: int | None = None,
-    ) -> None:
-        """Seal the row of `store` with other values; `pruned` and `version` are None to leave those as they are."""
-        row = connection.execute(select(schema.store)).one()
-        listed = row.pruned if pruned is None else pruned_to_text(pruned)
-        version = row.schema_version if version is None else version
-        sealed = schema.checksum(version, row.created_at, row.evermap_version, head, record, listed)
-        values = {"schema_version": version, "head": head, "record": record, "pruned": listed, "checksum": sealed}
-        connection.execute(update(schema.store).values(values))
-        announce(connection, connection.get_execution_options().get("schema", ""))
-
-    def _chain(self, connection: Connection, since: int = 1) -> tuple[dict[int, Record], dict[int, bytes | None]]:
-        """Records from a revision to the newest, each checked against the one after it; and which are lost."""
-        head, expected = self._anchor(connection)
-        if self._history is not None and self._history[0] == (head, expected) and self._history[1] <= since:
-            return self._history[2:]
-        anchor = head, expected
-        table = schema.revision.c
-        listed: dict[int, Any] = {
-            row.number: row.record
-            for row in connection.execute(select(table.number, table.record).where(table.number >= since))
-        }
-        names = {bytes(name) for name in listed.values() if isinstance(name, bytes)}
-        for name, data in self._fetched(connection, names - self._records.keys(), missing_ok=True).items():
-            try:
-                self._records[name] = Record.of_text(content.read_text(name, data))
-            except DamagedError as error:
-                raise DamagedError(f"{error}, of the record of a revision") from None
-        found: dict[int, Record] = {}
-        lost: dict[int, bytes | None] = {}
-        for number in range(head, max(since, 1) - 1, -1):
-            if number in lost:
-                expected = lost[number]
-                continue
-            record = None if expected is None else self._records.get(expected)
-            if record is None or record.number != number or listed.get(number) != expected:
-                raise DamagedError(f"a checksum does not match: revision {number} is not the one that was written")
-            found[number] = record
-            lost |= record.lost
-            expected = record.parent
-        self._history = anchor, since, found, lost
-        return found, lost
-
-    def _record(self, connection: Connection, number: int) -> Record:
-        """The record of a revision.
-
-        Raises:
-            InputError: it is lost.
-        """
-        found, _ = self._chain(connection, number)
-        if number not in found:
-            hint = f"evermap map log {self.where}"
-            raise InputError(f"revision {number} was lost to damage of the file", path=self.where, hint=hint)
-        return found[number]
-
-    def _records_of(self, connection: Connection, revisions: Collection[int] | None) -> list[Record]:
-        """Records of some revisions, oldest first; of the lineage of the newest if not told which."""
-        records, _ = self._chain(connection)
-        wanted = self._lineage(connection, None) if revisions is None else sorted(revisions)
-        return [records[number] for number in wanted if number in records]
-
     def _unpacked(self, connection: Connection, record: Record) -> LivingMap:
         read: set[bytes] = set()
 
         def fetch(names: Iterable[bytes]) -> Mapping[bytes, bytes]:
-            found = self._fetched(connection, names)
+            found = fetch_chunks(connection, names)
             read.update(found)
             return found
 
@@ -645,7 +538,7 @@ class SqlStore(Shown, MapStore):
         """The clique that a landmark belonged to in each of some revisions; None where it was not known."""
         names = [f"{content.MEMBERS}{name}" for name in ("landmark_id", "clique_id")]
         every = content.unpack_columns_of(
-            {record.content for record in records}, names, partial(self._fetched, connection)
+            {record.content for record in records}, names, partial(fetch_chunks, connection)
         )
         found: dict[int, int | None] = {}
         for record in records:
@@ -657,69 +550,8 @@ class SqlStore(Shown, MapStore):
     def _columns(self, connection: Connection, record: Record, *names: str) -> list[NDArray[Any]]:
         """Columns of the landmarks of a revision, without the rest of its map."""
         listed = [content.MEMBERS + name for name in names]
-        found = content.unpack_columns(record.content, listed, partial(self._fetched, connection))
+        found = content.unpack_columns(record.content, listed, partial(fetch_chunks, connection))
         return [found[name] for name in listed]
-
-    def _fetched(
-        self, connection: Connection, names: Iterable[bytes], *, missing_ok: bool = False
-    ) -> dict[bytes, bytes]:
-        """`content.Fetch` from the database."""
-        question = select(schema.chunk).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
-        found: dict[bytes, bytes] = {}
-        wanted = set(names)
-        for some in _batches(wanted):
-            for name, data in connection.execute(question, {"names": some}):
-                if not isinstance(name, bytes) or not isinstance(data, bytes):
-                    raise DamagedError("a part of the map is not made of bytes")
-                found[name] = data
-        if not missing_ok and found.keys() != wanted:
-            raise DamagedError("a part of the map is missing")
-        return open_members(found, partial(self._pack, connection), missing_ok=missing_ok)
-
-    def _pack(self, connection: Connection, name: bytes) -> bytes:
-        found = connection.execute(select(schema.chunk.c.data).where(schema.chunk.c.name == name)).scalar()
-        if not isinstance(found, bytes):
-            raise DamagedError("a pack of the map is missing")
-        return found
-
-    def _schema_version(self, connection: Connection) -> int:
-        """0 where there are no tables at all.
-
-        Raises:
-            InputError: tables of something else, or of a newer evermap.
-        """
-        tables = inspect(connection).get_table_names()
-        if not tables:
-            return 0
-        if "store" not in tables or "revision" not in tables:
-            raise InputError("is a database, but not an evermap map", path=self.where, hint="another file")
-        version = connection.execute(select(schema.store.c.schema_version)).scalar()
-        if not isinstance(version, int) or version < 1:
-            raise DamagedError(f"its schema version is {version!r}")
-        if version > schema.PACKED_VERSION:
-            problem = (
-                f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.PACKED_VERSION}"
-            )
-            raise InputError(problem, path=self.where, hint="open it with a newer evermap")
-        columns = {column["name"] for column in inspect(connection).get_columns("store")}
-        today = set(tables) == schema.metadata.tables.keys() and columns == set(schema.store.columns.keys())
-        if (version < schema.SCHEMA_VERSION) == today:
-            raise DamagedError(f"its schema version is {version}, but its tables are of another")
-        return version
-
-    def _known(self, connection: Connection, revision: int | None) -> int:
-        """The number of a revision that exists."""
-        head, _ = self._anchor(connection)
-        number = head if revision is None else revision
-        if not 0 <= number <= head:
-            there = f"it has {head} of them" if head else "it has none yet"
-            raise InputError(f"no revision {number}; {there}", path=self.where, hint=f"evermap map log {self.where}")
-        return number
-
-    def _lineage(self, connection: Connection, revision: int | None) -> tuple[int, ...]:
-        number = self._known(connection, revision)
-        records, _ = self._chain(connection)
-        return lineage({k: record.origin for k, record in records.items()}, number)
 
     @contextmanager
     def _transaction(self, *, writes: bool = False) -> Iterator[Connection]:
@@ -753,7 +585,6 @@ class SqlStore(Shown, MapStore):
         return DamagedMapError(f"damaged: {problem}", path=self.where, hint="a copy of the file")
 
 
-_STORE_COLUMNS = ("schema_version", "created_at", "evermap_version", "head", "record")
 _FAILURES = (
     ("readonly", "cannot be written: it is read-only", "chmod u+w, or a copy of it"),
     ("locked", "another process keeps it locked", "wait for that one to end"),
@@ -761,47 +592,3 @@ _FAILURES = (
     ("unable to open", "cannot be opened or written", "check the rights of the file and of its folder"),
 )
 """Common failures of a database other than damage, with hints."""
-
-
-def is_anchor(values: Sequence[Any]) -> bool:
-    """Return whether these are the values of the row of `store`, as it was written."""
-    if len(values) not in (6, 7):  # six before schema 4
-        return False
-    version, created_at, writer, head, record, checksum, pruned = (*values, None)[:7]
-    return (
-        type(version) is int
-        and type(head) is int
-        and isinstance(created_at, str)
-        and isinstance(writer, str)
-        and (record is None or isinstance(record, bytes))
-        and (pruned is None or isinstance(pruned, str))
-        and checksum == schema.checksum(version, created_at, writer, head, record, pruned)
-    )
-
-
-def announce(connection: Connection, what: str) -> None:
-    """Tell all who listen (`postgres.Announcements`) the schema of a site, '' for all, once the transaction is
-    committed; nothing in SQLite.
-    """
-    if connection.dialect.name == "postgresql":
-        connection.execute(select(func.pg_notify(CHANNEL, what)))
-
-
-def _by_time(parts: Sequence[Evidence], since_s: float) -> Evidence:
-    """Join evidence, by time, without what is older. Of a long history most parts are one clique's, in order."""
-    every = parts[0].joined(*parts[1:]) if parts else Evidence.empty()
-    if len(every) and (every.stamp_s[0] < since_s or np.any(np.diff(every.stamp_s) < 0.0)):
-        every = every[every.stamp_s >= since_s]
-        every = every[np.argsort(every.stamp_s, kind="stable")]
-    return every
-
-
-def now_utc() -> str:
-    """Return ISO 8601, to the second."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _batches(names: Iterable[bytes], size: int = _AT_ONCE) -> Iterator[list[bytes]]:
-    wanted = list(names)
-    for at in range(0, len(wanted), size):
-        yield wanted[at : at + size]

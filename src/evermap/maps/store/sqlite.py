@@ -22,12 +22,13 @@ from sqlalchemy import Connection, Engine, NullPool, create_engine, event
 from evermap.errors import InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import content
+from evermap.maps.store.anchor import is_anchor
 from evermap.maps.store.content import NAME_BYTES, DamagedError, is_chunk
 from evermap.maps.store.history import Record, ranges, read_pruned
 from evermap.maps.store.measured import looks_of
 from evermap.maps.store.packs import with_members
 from evermap.maps.store.protocol import DamagedMapError, Provenance
-from evermap.maps.store.sql import SqlStore, is_anchor
+from evermap.maps.store.sql import SqlStore
 
 _PATIENCE_S = 20.0
 """So long one waits for another process to finish its commit."""

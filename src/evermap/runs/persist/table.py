@@ -13,8 +13,8 @@ import numpy as np
 from evermap.config import PersistConfig
 from evermap.errors import ConfigError, InputError
 from evermap.existence.protocol import Looks, feature_of, firsts_of
+from evermap.io.arrow import arrow_cells, pa, pq
 from evermap.io.columns import Columns, DataFrame, TableSource, natural_order, parquet_batches, path_of, read_columns
-from evermap.io.table import arrow_cells, pa, pq
 from evermap.io.text import counted, quote
 from evermap.show import Shown
 from evermap.types import DEFAULT_P_FALSE, DEFAULT_P_MISS, UNKNOWN, BoolArray, Clock, FloatArray, IntArray

@@ -19,8 +19,8 @@ import numpy as np
 
 from evermap.config import NO_RECURRENCE, PersistConfig
 from evermap.errors import ConfigError, EvermapError
+from evermap.io.arrow import arrow_cells
 from evermap.io.columns import csv_bytes, named, needs_quotes
-from evermap.io.table import arrow_cells
 from evermap.metrics.belief import Reliability
 from evermap.runs.folder import RunFolder
 from evermap.runs.persist.changes import MOST_FEATURES, most_changed

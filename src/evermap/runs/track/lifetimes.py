@@ -21,10 +21,10 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, json_number
 from evermap.valid import X_M, Y_M, Quantity
 
 if TYPE_CHECKING:
+    from evermap.survival.hazard_posterior import HazardPosterior
     from evermap.survival.hazard_regression import HazardDraws
     from evermap.survival.nonparametric import KaplanMeier, Npmle
     from evermap.survival.parametric_fit import ParametricFit
-    from evermap.survival.pooled_hazards import HazardPosterior
 
     Fitted = Npmle | KaplanMeier | ParametricFit | HazardDraws | HazardPosterior
 
@@ -363,7 +363,8 @@ def _gaussian_process(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> 
 def _fit_pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
     """Hazards by age of which groups have a part in common."""
     from evermap.maps.lives import general_purpose
-    from evermap.survival.pooled_hazards import StayAges, learn_hazards
+    from evermap.survival.pooled_hazards import learn_hazards
+    from evermap.survival.stay_likelihood import StayAges
 
     group = np.zeros(len(table), dtype=np.int64)
     for number, one in enumerate(groups):

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from evermap.io.arrow import parquet_bytes
 from evermap.io.columns import csv_bytes, named
 from evermap.io.spatial import COVARIANCE, upper_triangle
-from evermap.io.table import parquet_bytes
 from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
 from evermap.tracking.record import BOX_COLUMNS
 from evermap.tracking.run import TrackResult

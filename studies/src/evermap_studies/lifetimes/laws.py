@@ -18,7 +18,8 @@ from evermap.survival import Exponential, LifetimePrior, LogNormal, Mixture, Wei
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.gaussian_process import gp_fit
 from evermap.survival.parametric_fit import fit
-from evermap.survival.pooled_hazards import StayAges, learn_hazards
+from evermap.survival.pooled_hazards import learn_hazards
+from evermap.survival.stay_likelihood import StayAges
 from evermap.types import FloatArray
 
 HOUR_S, DAY_S = 3600.0, 86_400.0
