@@ -204,6 +204,29 @@ def test_one_of_two_side_by_side_moves_without_the_other(dim: int, along_m: floa
     assert found.drift_m <= 0.02, "what it moved by is no drift of all others"
 
 
+def test_a_body_taken_apart_pays_for_that_and_for_each_member() -> None:
+    """Where all stand, both readings have one density: they differ by the prior alone."""
+    one = world(np.random.default_rng(34), [1] * 6 + [3], [1] * 6 + [2], [0] * 7, sigma_m=0.01)
+    options = _Options(one.sighted, one.known, agreed(one), USUAL, 0.8)
+    whole = np.array([0, 1, 2, 3, 4, 5, 6])
+    parted, each = options.parted(np.array([6]), whole)
+    assert parted.concluded(each).place[6:].tolist() == options.concluded(whole).place[6:].tolist()
+    paid = parted.log_probability(each) - options.log_probability(whole)
+    assert paid == pytest.approx(np.log(0.2) + 2.0 * one.known.log_p_site[6])
+
+
+def test_a_move_of_a_few_sigmas_takes_a_body_apart_where_the_odds_are_for_it() -> None:
+    one = world(np.random.default_rng(35), [1] * 12 + [2], [1] * 13, [0] * 13, sigma_m=0.003)
+    line = one.sighted.position_m[13] - one.sighted.position_m[12]
+    one.sighted.position_m[13] += 0.07 * line / np.linalg.norm(line)
+    options = _Options(one.sighted, one.known, agreed(one), USUAL, 0.9)
+    odds = options.log_odds_apart(np.arange(13))[12]
+    assert 1.0 < odds < 8.0
+    found = laid(one)
+    assert np.flatnonzero(found.place < 0).tolist() == [13]
+    assert found.probability[13] == pytest.approx(1.0 / (1.0 + np.exp(-odds)), abs=0.1)
+
+
 def test_a_body_that_turned_moved_as_one() -> None:
     """Both of its landmarks are elsewhere, as far apart as ever: they are not taken apart."""
     one = world(np.random.default_rng(32), [1] * 6 + [2], [1] * 7, [0] * 7, sigma_m=0.01)
