@@ -45,6 +45,20 @@ def test_a_token_has_a_burst_and_then_its_rate(monkeypatch: pytest.MonkeyPatch) 
     assert admitted(300) == 200
 
 
+def test_who_asks_twice_as_often_as_allowed_is_admitted_every_other_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A refused request costs nothing: with the fraction of a token that it took nobody got in again before a pause."""
+    now = [0.0]
+    monkeypatch.setattr(state.time, "monotonic", lambda: now[0])
+    server = a_server(10.0)
+    for _ in range(200):
+        assert server.admits("token", "steady")
+    admitted = 0
+    for _ in range(40):
+        now[0] += 0.05
+        admitted += server.admits("token", "steady")
+    assert admitted == 20
+
+
 def test_who_asked_least_recently_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(state, "_MOST_COUNTED", 2)
     server = a_server(0.0)

@@ -55,7 +55,7 @@ class Server:
         now = time.monotonic()
         left, since = self._budget.pop((kind, who), (_BURST, now))
         left = min(_BURST, left + (now - since) * self.rate_hz)
-        self._budget[kind, who] = (max(left - 1.0, 0.0), now)
+        self._budget[kind, who] = (left - 1.0 if left >= 1.0 else left, now)
         if len(self._budget) > _MOST_COUNTED:
             self._budget.pop(next(iter(self._budget)))
         return left >= 1.0
