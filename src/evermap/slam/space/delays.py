@@ -96,7 +96,8 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
         if np.abs(optimum.estimate.delay_s - free.whole_s).max() < SETTLED * find_step_s(problem):
             break
         variance = np.diag(smoother.factorised(now).border_covariance())[delay]
-        jitter = _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s)
+        variance = np.where(asked, variance, sigma_s**2)  # those that were held say nothing of theirs
+        jitter = np.where(asked, _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s), jitter)
     if _is_of_step(optimum.estimate.delay_s, least_s):
         return stated, None
     sober = replace(free, delay_sigma_s=np.where(asked, narrow**-0.5, 0.0))
