@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,8 +22,7 @@ CONFIG = Config()
 def two_cameras(seed: int, late_s: float, *, in_map: bool = False) -> tuple[SpatialRecording, Landmarks | None]:
     """A robot on a field sees tags as poses with two cameras, of which the one that looks back is late."""
     drive = late(late_s, 1)(simulate(MAKES["poses"], seed, in_map=in_map), np.random.default_rng(0))
-    recording = as_recording(drive)
-    assert isinstance(recording, SpatialRecording)
+    recording: Any = as_recording(drive)
     return recording, drive.places
 
 
