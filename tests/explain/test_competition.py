@@ -16,7 +16,6 @@ from evermap.explain.causes import Inputs, Suspect, list_suspects
 from evermap.explain.competition import SessionSolution, Solve, Trial, _screen_pairs
 from evermap.explain.evidence import Screen, optimum_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
-from evermap.explain.seeds import find_delay
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
@@ -24,6 +23,7 @@ from evermap.geometry.se3 import transform as transform_space
 from evermap.maps.sessions import session
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.session import Visit
+from evermap.slam.clocks import find_delay
 from evermap.slam.mistakes import USUAL, pairs_of
 from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
 

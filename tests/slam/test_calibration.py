@@ -8,11 +8,12 @@ from itertools import product
 import numpy as np
 import pytest
 from problems import default_prior, make_world
-from scipy.stats import multivariate_normal
+from scipy.stats import chi2, multivariate_normal
 
 from evermap.config import Config, OdometryConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.metrics.summary import compare_with_truth
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.pipeline import run_slam
 from evermap.slam.calibration import BEARING, FORWARD, NAMES, SLOPE, SPECS, USUAL, CalibrationPrior, needed
@@ -185,7 +186,7 @@ def test_evidence_of_states_is_that_of_a_gaussian_by_brute_force():
     for some in product((False, True), repeat=len(free)):
         on = free[np.array(some)]
         covariance = np.eye(12) + (design[:, on] * prior.sigma[on] ** 2) @ design[:, on].T
-        p = np.select([free < 5, free < 7], [0.8, 0.1], 0.5)
+        p = np.where(free < 5, 0.8, 0.5)
         odds.append(
             multivariate_normal(np.zeros(12), covariance).logpdf(reading) + np.log(np.where(some, p, 1 - p)).sum()
         )
@@ -200,7 +201,7 @@ def test_evidence_of_states_is_that_of_a_gaussian_by_brute_force():
     assert found[free] == pytest.approx(expected, abs=1e-7)
     assert np.isnan(found[~prior.free]).all()
     # readings that are worth a hundredth tell less
-    before = np.select([free < 5, free < 7], [0.8, 0.1], 0.5)
+    before = np.where(free < 5, 0.8, 0.5)
     assert np.all(np.abs(needed(prior, states, covariance, np.full(11, 1e6))[free] - before) < 0.05)
 
 
@@ -209,7 +210,7 @@ def test_the_gaussian_of_the_prior_has_the_variance_of_the_mixture():
     rng = np.random.default_rng(0)
     drawn = rng.normal(0.0, prior.sigma, (200_000, len(NAMES))) * (rng.random((200_000, len(NAMES))) < prior.p_needed)
     assert prior.gaussian().sigma == pytest.approx(drawn.std(axis=0), rel=0.02)
-    assert prior.p_needed[NAMES.index("mount_left_m")] == 0.1
+    assert prior.p_needed[NAMES.index("mount_left_m")] == 0.5
 
 
 def test_readings_that_repeat_themselves_are_worth_one():
@@ -474,3 +475,17 @@ def test_a_gyroscope_that_jitters_on_the_straight_says_nothing_of_its_scale(seed
     true = recording.truth.pose_world_robot[at]
     off = se2.between(se2.compose(se2.inverse(true[0]), true), result.trajectory.pose_world_robot)[:, 2]
     assert np.sqrt(np.mean(off**2)) < 2.0 * np.sqrt(result.trajectory.covariance[:, 2, 2].mean())
+
+
+def test_poses_in_a_map_are_known_as_well_as_the_place_of_the_sensor_on_the_robot():
+    """Mounts of robots are off by 4 cm, on most axes of six in ten: poses were held to be surer than they are (2.3)."""
+    nees = []
+    for seed in range(4100, 4125):
+        made = draw_robot(seed)
+        recording = simulate_robot(replace(made, duration_s=120.0), seed)
+        places = recording.true_landmarks
+        known = np.broadcast_to(1e-4 * np.eye(2), (len(places), 2, 2)).copy()
+        result = run_slam(recording, prior_map=replace(places, covariance_m2=known))
+        found = compare_with_truth(recording, result, rate_hz=2.0).poses
+        nees.append(np.median(found.nees) / chi2.median(found.dof))
+    assert 0.5 < np.mean(nees) < 1.6

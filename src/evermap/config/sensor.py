@@ -57,9 +57,6 @@ class CalibrationConfig(Section):
     p_needed: Share = rule(0.5, "prior probability that a state is not as stated")
     p_needed_sensor: Share = rule(0.1, "the same of errors of ranges, for a laser or a sensor of no stated kind")
     p_needed_known: Share = rule(0.9, "the same of a sensor that is stated to be of another kind than a laser")
-    p_needed_mount: Share = rule(
-        0.1, "the same of each coordinate of the mount, which one measures, if it has no data sheet"
-    )
     p_spare: Share = rule(0.01, "probability to be needed below which a state is held as stated")
 
     @field_validator("sigma", "kinds")

@@ -87,7 +87,7 @@ def _refuse_rules(content: Mapping[str, Any], prefix: tuple[str, ...], path: Pat
 
 RETIRED = (
     "living.lifetimes.prior_quantiles", "living.lifetimes.prior_shortest_s", "living.lifetimes.prior_longest_s",
-    "living.overlay.turn_m", "living.overlay.p_split",
+    "living.overlay.turn_m", "living.overlay.p_split", "slam.calibration.p_needed_mount",
 )  # fmt: skip
 """Keys of earlier versions which nothing reads any more; maps keep them with the settings of their sessions."""
 

@@ -31,20 +31,11 @@ from evermap.explain.evidence import (
 )
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
 from evermap.explain.scores import score_session
-from evermap.explain.seeds import (
-    FALLS,
-    find_delay,
-    find_mount,
-    find_pair_loss,
-    find_scales,
-    find_sensor_scales,
-    find_shape,
-    find_single_scales,
-    late_by,
-)
+from evermap.explain.seeds import find_mount, find_scales, find_sensor_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes
 from evermap.explain.symptoms import SURELY, compare_odometry, find_odometry_delay
 from evermap.slam.check import find_misreadings
+from evermap.slam.clocks import FALLS, find_delay, find_pair_loss, late_by
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import pairs_of
 from evermap.slam.room import ROOM_M

@@ -6,7 +6,6 @@
 * Landmarks of a solution that was not found in a map, against the map: all lengths.
 * Directions from several poses meet at the landmark, which says how far it was: ranges of one landmark.
 * Two sightings of one landmark and the odometry between them, in turns: where the sensor sits on the robot.
-* The same, with the odometry of another time between them: how late a clock is.
 """
 
 from __future__ import annotations
@@ -19,7 +18,8 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
-from evermap.slam.mistakes import HONEST, Mistake, Pairs, find_motion, off, pairs_of
+from evermap.slam.clocks import FALLS, find_pair_loss
+from evermap.slam.mistakes import HONEST, Mistake, find_motion, off, pairs_of
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -44,10 +44,8 @@ OF_MEDIAN, TIMES_SIGMA = 1.86, 5.0
 which it is not 0."""
 FEWEST_VIEWS, PARALLAX = 6, 0.02
 """Views of a landmark, and the least share of them that are crosswise, from which directions say how far it is."""
-LATEST_S, DELAY_STEP_S, DELAY_FINE_S = 5.0, 0.25, 0.01
-"""Delays that are tried: up to this, at first in such steps, within which motions are alike, and at last in these."""
-MOUNT_STEPS, FALLS = 8, 0.2
-"""Steps towards the place of a sensor, and share by which the loss of pairs must fall."""
+MOUNT_STEPS = 8
+"""Steps towards the place of a sensor."""
 MOST_PAIRS = 4000
 """Pairs of a kind that are looked at: more say no more."""
 
@@ -193,31 +191,6 @@ def _against_odometry(recording: AnyRecording, settings: CheckConfig) -> float:
     tried = np.linspace(-LARGEST, LARGEST, STEPS)
     losses = [find_pair_loss(pairs, settings, Mistake("", "", lengths=math.exp(state))) for state in tried.tolist()]
     return float(tried[int(np.argmin(losses))])
-
-
-def find_pair_loss(pairs: Pairs, settings: CheckConfig, mistake: Mistake = HONEST) -> float:
-    """Return Cauchy's loss of pairs of sightings [nats], those without a mistake of the readings."""
-    apart = np.minimum(off(pairs.residual(mistake)), 10.0)
-    return float(np.log1p((apart / settings.fits) ** 2).sum())
-
-
-def find_delay(pairs: Pairs, settings: CheckConfig) -> float:
-    """Return by how much stamps of detections are late for landmarks to stand still [s].
-
-    The score of a solution sees a delay as far as motions last, some .1 s; pairs of sightings say how far it is.
-    """
-    best, step = 0.0, DELAY_STEP_S
-    tried = np.arange(-LATEST_S, LATEST_S + step, step)
-    while step > DELAY_FINE_S:
-        losses = [find_pair_loss(pairs, settings, late_by(by)) for by in tried.tolist()]
-        best = float(tried[int(np.argmin(losses))])
-        tried, step = best + step * np.linspace(-1.0, 1.0, 9), step / 4.0
-    return best
-
-
-def late_by(delay_s: float) -> Mistake:
-    """Return the mistake of detections that are stamped so late: to their clock the odometry is early."""
-    return Mistake("clock", "", delay_s=-delay_s)
 
 
 def find_mount(recording: Recording, settings: CheckConfig) -> FloatArray:

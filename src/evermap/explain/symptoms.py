@@ -66,13 +66,13 @@ class Compared:
     """Detections beside where the map expects them, one row each, as a detection would have read them without noise.
 
     Attributes:
-        stamp_s, landmark_id, used: (K,) when, of which landmark, and whether it is no outlier.
+        taken_s, landmark_id, used: (K,) when, by the clock of the poses, of which landmark, and whether it is used.
         range_m: (K,) expected range.
         off: (K, D) detection less expectation over the expected range; of ranges only one number.
         point_m: (K, D) where detections are in the robot's frame; nan where they have a direction or a range only.
     """
 
-    stamp_s: FloatArray
+    taken_s: FloatArray
     landmark_id: IntArray
     used: BoolArray
     range_m: FloatArray
@@ -89,8 +89,8 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     """Return detections beside expectations, of those that have both, in the plane with the estimated calibration."""
     innovations, places = result.innovations, result.landmarks
     row, known = _rows_of(places, innovations.landmark_id)
-    stamp_s = innovations.stamp_s
-    pose, near = _poses_at(result.trajectory, stamp_s)
+    taken_s = innovations.stamp_s - _find_delays_s(recording, result)
+    pose, near = _poses_at(result.trajectory, taken_s)
     keep = known & near & (innovations.detection < len(recording.detections))
     detection, row, pose = innovations.detection[keep], row[keep], pose[keep]
     if is_in_space(recording):
@@ -118,8 +118,18 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     good = np.isfinite(off).all(axis=1)
     used = innovations.p_inlier[keep] >= USED
     return Compared(
-        stamp_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good], point[good]
+        taken_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good], point[good]
     )
+
+
+def _find_delays_s(recording: AnyRecording, result: SlamResult) -> FloatArray:
+    """Return (K,) by how much stamps of detections are late, as was estimated of the sensors in space."""
+    row = result.innovations.detection
+    if not is_in_space(recording):
+        return np.zeros(len(row))
+    value = {each.name: each.value for each in result.parameters}
+    delay_s = np.array([value.get(f"{one.name}_delay_s", 0.0) for one in recording.sensors])
+    return np.asarray(delay_s[recording.detections.sensor[np.minimum(row, len(recording.detections) - 1)]])
 
 
 def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:
@@ -150,7 +160,7 @@ def _rows_of(places: Landmarks, landmark_id: IntArray) -> tuple[IntArray, BoolAr
 
 
 def _poses_at(path: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the nearest poses, and whether they are near enough."""
+    """Return the poses at stamps (K,), in the plane the nearest ones, and whether the nearest are near enough."""
     if not len(path):
         return np.zeros((len(stamp_s), path.pose_world_robot.shape[1])), np.zeros(len(stamp_s), dtype=np.bool_)
     after = np.clip(np.searchsorted(path.stamp_s, stamp_s), 1, max(len(path) - 1, 1))
@@ -158,7 +168,9 @@ def _poses_at(path: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, BoolAr
     before = np.maximum(after - 1, 0)
     nearer = np.abs(path.stamp_s[before] - stamp_s) <= np.abs(path.stamp_s[after] - stamp_s)
     row = np.where(nearer, before, after)
-    return path.pose_world_robot[row], np.asarray(np.abs(path.stamp_s[row] - stamp_s) <= FARTHEST_S)
+    pose = path.pose_world_robot
+    at = pose[row] if pose.shape[1] == 3 else se3.interpolate(path.stamp_s, pose, stamp_s)
+    return at, np.asarray(np.abs(path.stamp_s[row] - stamp_s) <= FARTHEST_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,11 +422,11 @@ def _over_odometry(compared: Compared, result: SlamResult) -> float:
     if len(path) < 3 or len(other) != len(path) or not np.array_equal(path.stamp_s, other.stamp_s):
         return nan
     fine = np.isfinite(compared.point_m).all(axis=1)
-    stamp_s, point_m = compared.stamp_s[fine], compared.point_m[fine]
+    taken_s, point_m = compared.taken_s[fine], compared.point_m[fine]
     name, row, count = np.unique(compared.landmark_id[fine], return_inverse=True, return_counts=True)
     scatter = []
     for each in (path, other):
-        pose = _poses_at(each, stamp_s)[0]
+        pose = _poses_at(each, taken_s)[0]
         at = (se2 if pose.shape[1] == 3 else se3).transform(pose, point_m)
         middle = medians(at, row, len(name))[0][row]
         off = np.where(count[row] >= PER_LANDMARK, np.linalg.norm(at - middle, axis=1), nan)
@@ -430,7 +442,7 @@ def _between_halves(compared: Compared) -> tuple[float, float]:
     in both. In standard deviations of the difference by the scatter within halves, and over the range.
     """
     used = np.flatnonzero(compared.used)
-    used = used[np.lexsort((compared.stamp_s[used], compared.landmark_id[used]))]
+    used = used[np.lexsort((compared.taken_s[used], compared.landmark_id[used]))]
     _, row, count = np.unique(compared.landmark_id[used], return_inverse=True, return_counts=True)
     often = count >= 2 * PER_LANDMARK
     used, count = used[often[row]], count[often]

@@ -80,7 +80,7 @@ class CalibrationPrior:
         angle_share: of what bearing bias and driving askew show together, that is the sensor's.
         askew_sigma: standard deviation of the latter [rad].
         p_sensor: probability of each of the first five states to be another than stated, of the bearing bias at least
-            that of a state of the robot; p_mount: of each coordinate of the mount.
+            that of a state of the robot.
         settings: that it is of.
     """
 
@@ -91,7 +91,6 @@ class CalibrationPrior:
     angle_share: float = 1.0
     askew_sigma: float = 0.0
     p_sensor: float = USUAL.p_needed
-    p_mount: float = USUAL.p_needed_mount
     settings: CalibrationConfig = USUAL
 
     @classmethod
@@ -117,7 +116,7 @@ class CalibrationPrior:
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
         sigma = np.array([settings.sigma[name] for name in NAMES])
-        prior = cls(mean, sigma, free, p_mount=settings.p_needed_mount, settings=settings)
+        prior = cls(mean, sigma, free, settings=settings)
         return prior if sensor is None else prior._as_stated(sensor)
 
     def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
@@ -151,7 +150,6 @@ class CalibrationPrior:
             angle_share=angle_share,
             askew_sigma=askew,
             p_sensor=p_needed,
-            p_mount=self.settings.p_needed_mount if sensor.sigma_position_m is None else self.settings.p_needed,
         )
 
     def averaged(
@@ -217,7 +215,7 @@ class CalibrationPrior:
     def p_needed(self) -> FloatArray:
         """(11,) prior probability of each state to be another than stated."""
         p = np.full(N_STATES, self.settings.p_needed)
-        p[:BEARING], p[AHEAD : ASIDE + 1] = self.p_sensor, self.p_mount
+        p[:BEARING] = self.p_sensor
         p[BEARING] = max(self.p_sensor, self.settings.p_needed)  # the robot's driving askew as much as the sensor's
         return p
 

@@ -21,6 +21,7 @@ from evermap.config import CheckConfig, SlamConfig
 from evermap.errors import ConfigError
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se2, se3
+from evermap.slam.clocks import are_of_several_clocks
 from evermap.slam.mistakes import sighting_pairs, unusable
 from evermap.slam.orientations import find_convention, without_unmeasured
 from evermap.slam.space.intake import positions_of, without_range
@@ -93,6 +94,8 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
     if wrong is not None and not wrong.usable:  # refused by its name there: velocities in mm/s are no velocities
         return recording
     if wrong is not None and len(recording.sensors) > 1:  # their mounts, which the plane has not, are asked in space
+        return recording
+    if len(recording.sensors) > 1 and are_of_several_clocks(recording, settings.check):  # the plane has one sensor
         return recording
     if find_convention(recording, settings.check):  # of orientations, which the plane leaves out in silence
         return recording

@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap.config import Config
+from evermap.explain.symptoms import compare_detections
 from evermap.geometry import se3
 from evermap.io.spatial import spatial_detections
 from evermap.pipeline import run_slam
 from evermap.slam.space.problem import OdometryPath
-from evermap.types import Frames, SpatialOdometry, SpatialRecording, SpatialSensor
+from evermap.types import Frames, SpatialOdometry, SpatialRecording, SpatialSensor, VerdictKind
 
 STEP = 1e-6
 
@@ -48,8 +49,11 @@ def test_jitter_is_what_was_added_at_random():
     assert a_path(3).jitter == pytest.approx(np.zeros(6), abs=1e-20)
 
 
-def stopping(late_s: float, seed: int) -> SpatialRecording:
-    """A robot drives around a square, and stands for as long; odometry twice a second, frames that are stamped late."""
+def stopping(late_s: float, seed: int, frame_s: float = 0.2, lag_s: float = 0.0) -> SpatialRecording:
+    """A robot drives around a square, and stands for as long; odometry twice a second, frames that are stamped late.
+
+    The odometry is where the robot was `lag_s` before its stamps.
+    """
     random = np.random.default_rng(seed)
     side = [(1.5, 0.0)] * 300 + [(0.8, np.pi / 6.0)] * 150  # fifty a second
     wanted = np.array((side * 4 + [(0.0, 0.0)] * 1800) * 2)
@@ -63,10 +67,11 @@ def stopping(late_s: float, seed: int) -> SpatialRecording:
         return pose
 
     true = path(rate)
-    driven = path(rate * np.repeat(random.normal(1.0, 0.02, (len(rate) // 50, 2)), 50, axis=0))[::25]
+    driven = path(rate * np.repeat(random.normal(1.0, 0.02, (len(rate) // 50, 2)), 50, axis=0))
+    driven = driven[np.maximum(np.arange(0, len(rate), 25) - round(50 * lag_s), 0)]
     beside = random.choice([-1.0, 1.0], (40, 2)) * random.uniform(2.0, 4.0, (40, 2))
     place = np.column_stack([true[random.integers(0, 1800, 40), :2] + beside, random.uniform(-1.0, 2.0, 40)])
-    at = np.arange(0, len(rate), 10)
+    at = np.arange(0, len(rate), round(50 * frame_s))
     away = se3.transform(se3.inverse(true[at])[:, None], place[None])
     far = np.linalg.norm(away, axis=2)
     frame, name = np.nonzero((far < 8.0) & (away[..., 0] > 0.6 * far) & (random.random(far.shape) < 0.8))
@@ -89,3 +94,36 @@ def test_stops_hide_no_delay_in_space():
     delay = next(one for one in result.parameters if one.name == "sensor_delay_s")
     assert delay.p_needed > 0.99
     assert delay.value == pytest.approx(0.2, abs=0.025)
+
+
+@pytest.mark.parametrize(("late_s", "frame_s"), [(0.2, 0.1), (0.24, 0.1), (0.24, 0.2), (0.0, 0.1), (-0.2, 0.1)])
+def test_a_delay_shorter_than_a_step_of_slow_odometry_is_found_in_space(late_s, frame_s):
+    """Frames are denser than the odometry, whose stamps are some of theirs where all are by one clock.
+
+    As of odometry that was made of the frames, no delay was asked; and by a velocity over a second it was .03 s off.
+    """
+    result = run_slam(stopping(late_s, 1, frame_s), Config.model_validate({"slam": {"plane": False}}))
+    delay = next(one for one in result.parameters if one.name == "sensor_delay_s")
+    assert delay.value == pytest.approx(late_s, abs=0.015)
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SOUND
+
+
+@pytest.mark.parametrize(("lag_s", "found_s"), [(-0.2, 0.2), (0.0, None), (0.2, None), (0.3, -0.3)])
+def test_odometry_with_the_stamps_of_all_frames_may_be_late_by_half_a_step(lag_s, found_s):
+    """As visual odometry is, whose velocity is that of the step before. Nothing of it makes detections late: a robot
+    logs both in one loop.
+    """
+    result = run_slam(stopping(0.0, 1, 0.5, lag_s), Config.model_validate({"slam": {"plane": False}}))
+    delay = [one.value for one in result.parameters if one.name == "sensor_delay_s"]
+    assert delay == ([] if found_s is None else [pytest.approx(found_s, abs=0.02)])
+    assert result.verdict is not None
+    assert (result.verdict.kind is VerdictKind.SOUND) == (lag_s != 0.2)
+
+
+def test_late_detections_are_compared_with_poses_of_when_they_were_taken():
+    """At their stamps the robot is .2 m farther: halves of a right solution differed by 13 % of the range."""
+    config = Config.model_validate({"slam": {"plane": False}})
+    late, punctual = (stopping(late_s, 1, 0.1) for late_s in (0.24, 0.0))
+    off, usual = (np.median(compare_detections(each, run_slam(each, config)).misfit) for each in (late, punctual))
+    assert off == pytest.approx(usual, rel=0.05)

@@ -6,8 +6,8 @@ that may be are freed. As for the states in the plane (`slam.calibration`), 'as 
 weighed by their evidence, under the number of observations that the data are worth, and the estimate is the mean.
 
 An odometry with the stamps of the frames may have been made of them, as visual odometry is: its clock is theirs, and
-its velocity is that of a step, not of an instant, so that within half a step no delay is told. But a robot that logs
-all that it knows in one loop gives the same stamps to detections that are late, by a step or more.
+its velocity is that of the step before, not of an instant, so that detections that seem early by less than half a step
+are not. Nothing of it makes detections late: they are where a robot logs all that it knows in one loop.
 
 A delay shows where the velocity changes. Odometry that jitters seems to change its velocity all the time, which shows
 no delay: the velocity is averaged over the time that shows most, and what jitter is left in it does not count.
@@ -35,7 +35,7 @@ LEAST_SHARE = 1e-3
 LONGEST_S = 2.0
 """Time before and after an instant over which the velocity there is averaged, at most."""
 OF_STEP = 0.5
-"""Least delay that an odometry with the stamps of the frames shows, in its steps."""
+"""By how much detections seem early at least, in steps of an odometry with the stamps of the frames, that are."""
 MOST_ROUNDS, SETTLED = 4, 0.75
 """Times that delays are freed, until the whole steps in them are right to within so many."""
 USUAL = CalibrationConfig()
@@ -70,7 +70,7 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
     information, jitters = factorised.information.copy(), np.zeros(len(factorised.right))
     jitters[delay] = jitter
     off_s = np.asarray(np.linalg.solve(information - np.diag(jitters), factorised.right)[delay])
-    if least_s and np.abs(off_s).max() < least_s:
+    if _is_of_step(off_s, least_s):
         return optimum, None
     found, _ = _priced(smoother, now, off_s, sigma_s, jitter)
     # of a clock that is left as stated it is told how late it is if it is not
@@ -93,14 +93,31 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
         again, narrow = _priced(smoother, now, optimum.estimate.delay_s, sigma_s, np.zeros(count))
         found = Delays(np.where(asked, again.sigma_s, found.sigma_s), np.where(asked, again.p_needed, found.p_needed))
         least = USUAL.p_spare
-        if np.abs(optimum.estimate.delay_s - free.whole_s).max() < SETTLED * problem.path.step_s:
+        if np.abs(optimum.estimate.delay_s - free.whole_s).max() < SETTLED * find_step_s(problem):
             break
         variance = np.diag(smoother.factorised(now).border_covariance())[delay]
-        jitter = _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s)
-    if least_s and np.abs(optimum.estimate.delay_s).max() < least_s:
+        variance = np.where(asked, variance, sigma_s**2)  # those that were held say nothing of theirs
+        jitter = np.where(asked, _jitter(smoother, now, 1.0 / (1.0 / variance + free.delay_jitter), sigma_s), jitter)
+    if _is_of_step(optimum.estimate.delay_s, least_s):
         return stated, None
     sober = replace(free, delay_sigma_s=np.where(asked, narrow**-0.5, 0.0))
     return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
+
+
+def _is_of_step(delay_s: FloatArray, least_s: float) -> bool:
+    """Return whether delays (S,) are those of an odometry made of the frames: early, by less than so much."""
+    return bool(((delay_s <= 0.0) & (delay_s > -least_s)).all())
+
+
+def find_step_s(problem: SpatialProblem) -> float:
+    """Return the steps in which delays are taken back along the path [s]; the rest is by an averaged velocity.
+
+    Steps of the odometry, between whose stamps it is interpolated; or those of the poses, where these are denser: after
+    such a step poses lie between stamps as often as before, and a velocity that is averaged over slow odometry is not
+    that of an instant.
+    """
+    assert problem.path is not None
+    return min(problem.path.step_s, float(np.median(np.diff(problem.stamp_s))))
 
 
 def _freed(
@@ -109,7 +126,8 @@ def _freed(
     """Return the problem with delays of standard deviations (S,), near those (S,)."""
     assert problem.path is not None
     velocity_s = _averaged_over(problem, optimum.smoother.driven(optimum.now))
-    whole_s = problem.path.step_s * np.round(delay_s / problem.path.step_s)
+    step_s = find_step_s(problem)
+    whole_s = step_s * np.round(delay_s / step_s)
     return replace(problem, velocity_s=velocity_s, whole_s=whole_s, delay_sigma_s=sigma_s)
 
 

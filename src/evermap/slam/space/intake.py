@@ -168,7 +168,7 @@ def prepare_space(
         scale_sigma=scale[0] if driven else 0.0,
         ranges_share=scale[1],
         path=lead_on(recording, stamps[pose_frame[0]], settings.delay_sigma_s),
-        has_clock_of_frames=_has_clock_of_frames(recording.odometry, path_s),
+        has_clock_of_frames=_has_clock_of_frames(recording, path_s),
         measurements=seen.measurements,
         start_sigma=np.max([[1e-4] * 6, *(of.kind.first_sigma for of in seen.measurements)], axis=0),
         robust=robust,
@@ -515,15 +515,28 @@ def lead_on(recording: SpatialRecording, start_s: float, delay_sigma_s: float) -
     return OdometryPath(stamp_s, np.vstack([before, pose, after]))
 
 
-def _has_clock_of_frames(odometry: SpatialOdometry | None, frame_s: FloatArray) -> bool:
-    """Tell whether the odometry has the stamps of the frames (F,) and hardly any others."""
+def _has_clock_of_frames(recording: SpatialRecording, frame_s: FloatArray) -> bool:
+    """Tell whether the odometry has the stamps of the frames (F,) and hardly any others, and those of most frames in
+    which one of the sensors saw anything: fewer are of a clock that ticks slower.
+    """
+    odometry, seen = recording.odometry, recording.detections
     if odometry is None:
         return False
     own_s = odometry.stamp_s
     inside = own_s[(own_s >= frame_s[0]) & (own_s <= frame_s[-1])]
-    after = np.clip(np.searchsorted(frame_s, inside), 1, len(frame_s) - 1)
-    off_s = np.minimum(np.abs(frame_s[after] - inside), np.abs(inside - frame_s[after - 1]))
-    return bool(np.mean(off_s < SAME_S) > OF_FRAMES) if len(inside) else True
+    if not len(inside):
+        return True
+    if not np.mean(_find_nearest_s(frame_s, inside) < SAME_S) > OF_FRAMES:
+        return False
+    of_sensor = (np.unique(seen.frame[seen.sensor == row]) for row in range(len(recording.sensors)))
+    stamps = (recording.frames.stamp_s[rows] for rows in of_sensor if len(rows))
+    return any(np.mean(_find_nearest_s(own_s, stamp_s) < SAME_S) > OF_FRAMES for stamp_s in stamps)
+
+
+def _find_nearest_s(stamp_s: FloatArray, asked_s: FloatArray) -> FloatArray:
+    """Return (M,) times from those asked to the nearest of stamps (K,)."""
+    after = np.clip(np.searchsorted(stamp_s, asked_s), 1, len(stamp_s) - 1)
+    return np.minimum(np.abs(stamp_s[after] - asked_s), np.abs(asked_s - stamp_s[after - 1]))
 
 
 def _find_frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> PathFrames:

@@ -165,6 +165,8 @@ def solve_space(
         estimate, noise = begun.estimate, begun.noise
     problem, estimate = _in_measured_frame(problem, estimate, framed)
     optimum, delays = with_delays(with_range_noise(converged(problem, estimate, noise)))
+    if drift is not None and counted is None and optimum.estimate.delay_s.any():
+        optimum, drift = _without_lasting(optimum, drift, intake.driven_pose, in_map=scale_in_map > 0.0)
     if len(stated) and of_points and not problem.driven and (_is_doubtful(optimum) or has_contradictions(optimum)):
         optimum = _or_by_consensus(optimum, stated)
     optimum = with_range_noise(repaired(optimum))
@@ -285,6 +287,28 @@ def _with_drift(
             return problem, replace(alone.noise, pixel=noise.pixel), None, None
         noise = _with_drift_of(noise, drift)
     return replace(problem, share=share), noise, drift, None
+
+
+def _without_lasting(
+    optimum: SpatialOptimum, drift: Drift, driven: FloatArray, *, in_map: bool
+) -> tuple[SpatialOptimum, Drift | None]:
+    """Return the optimum at independent errors, without a drift, where these hold at its delays; else both as they are.
+
+    What is late errs for as long as the robot moves on, and an odometry that is held for exact leaves it so: whether
+    errors last shows once delays are known.
+    """
+    problem, noise = optimum.smoother.problem, start_noise(optimum.smoother.problem.settings, driven=True)
+    if problem.steady or drift.translation is None or (problem.share == 1.0).all():
+        return optimum, drift
+    alone = with_range_noise(converged(replace(problem, share=np.ones(len(problem.share))), optimum.estimate, noise))
+    if not (in_map or _is_of_one_metre(alone.estimate, driven)):
+        return optimum, drift
+    if not _are_independent(alone, drift.translation):
+        lasts = replace(alone.smoother.problem, share=problem.share)
+        lasting, _ = _likeliest_lasting(lasts, optimum.estimate, noise, drift)
+        if log_marginal_likelihood(alone, noise) <= lasting:
+            return optimum, drift
+    return alone, None
 
 
 def _with_drift_of(noise: SpatialNoise, drift: Drift) -> SpatialNoise:
