@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import evermap as em
-from evermap.config import Config, parse_config, to_toml
+from evermap.config import RETIRED, Config, parse_config, to_toml
 from evermap.errors import DataError, InputError
 from evermap.maps.diff import diff, story_of
 from evermap.maps.living import LivingMap
@@ -339,3 +339,6 @@ def test_a_configuration_is_read_back_from_a_revision() -> None:
     assert parse_config("") == Config()
     # of a map that was written before these keys were retired
     assert parse_config("[living.lifetimes]\nprior_quantiles = 64\nnewest = 200\n").living.lifetimes.newest == 200
+    for name in RETIRED:
+        section, _, key = name.rpartition(".")
+        assert parse_config(f"[{section}]\n{key} = 0.1\n") == Config()
