@@ -5,8 +5,8 @@ detections of it are hardly more than two. That it stands is a special case, vel
 makes of a changing view; the ratio of the two densities is the Bayes factor (Dickey 1971).
 
 A stay ended where its object was seen to move away. One that something hides as it leaves gets another track when it
-is seen again: two bodies are never in one spot, so what moves within the room of a box, beside its place, says that it
-stands there no more.
+is seen again: two bodies are never in one spot, so what turns up and moves within the room of a box, beside its place,
+is that box.
 """
 
 from __future__ import annotations
@@ -211,11 +211,16 @@ def _with_room_taken(
 ) -> Stood:  # fmt: skip
     """Return stays with ends that follow from what moves in their room shortly before, or after, they were seen.
 
-    It is not the object at its place, misjudged, but beside it, and deeper in its room than errors explain.
+    It is not the object at its place, misjudged, but beside it, and deeper in its room than errors explain. What was
+    seen elsewhere meanwhile is another one.
     """
     since_s, until_s = stood.since_s.copy(), stood.until_s.copy()
     moves = np.flatnonzero(stood.p_static < 0.5)
     beyond_m = settings.sure_sigmas * sigma_m[moves]
+    of = np.unique(track, return_inverse=True)[1].ravel()
+    first_s, last_s = np.full(len(track), np.inf), np.full(len(track), -np.inf)
+    np.minimum.at(first_s, of, stamp_s)
+    np.maximum.at(last_s, of, stamp_s)
     for k in range(len(stood.track)):
         mine = np.flatnonzero(stood.stay == k)
         here, size_m = np.median(at[mine], axis=0), np.median(box[mine, :2], axis=0)
@@ -227,8 +232,9 @@ def _with_room_taken(
         rows = moves[near]
         for ends, is_after in ((since_s, False), (until_s, True)):
             edge_s = float(stamp_s[mine[-1 if is_after else 0]])
-            lag_s = stamp_s[rows] - edge_s if is_after else edge_s - stamp_s[rows]
-            within = rows[(lag_s > 0.0) & (lag_s < settings.hidden_s)]
+            lag_s = np.abs(stamp_s[rows] - edge_s)
+            apart = first_s[of[rows]] > edge_s if is_after else last_s[of[rows]] < edge_s
+            within = rows[apart & (lag_s < settings.hidden_s)]
             if len(within) >= settings.fewest and np.isnan(ends[k]):
                 ends[k] = 0.5 * (edge_s + float(stamp_s[within[0 if is_after else -1]]))
     return stood._replace(since_s=since_s, until_s=until_s)
