@@ -120,6 +120,74 @@ def test_who_creeps_does_not_rest() -> None:
     assert len(box_track(1.5, 60)) == 0
 
 
+def stood_of(*ways: FloatArray, seed: int = 0) -> Stood:
+    """Which stood of boxes of a class each, along ways (F, 2) ten frames a second, nan where they are hidden."""
+    at, noise = np.array(ways), np.random.default_rng(seed)
+    seen = np.isfinite(at[..., 0])
+    frame, of = np.nonzero(seen.T)
+    count = len(frame)
+    position = np.column_stack([at[of, frame], np.full(count, 1.0)]) + noise.normal(0.0, 0.05, (count, 3))
+    table = DetectionTable(
+        source="made", class_names=("van", "car")[: len(at)], stamp_s=np.arange(at.shape[1]) / 10.0,
+        first=np.append(0, np.cumsum(seen.sum(axis=0))), position_m=position, class_id=of,
+        covariance_m2=None, appearance=None, sensor_m=np.tile([0.0, -8.0, 1.0], (at.shape[1], 1)),
+        line=np.arange(count) + 2, box=np.tile([5.4, 2.0, 2.3, 0.0], (count, 1)),
+    )  # fmt: skip
+    stood = run_track(table, TrackConfig()).stood
+    assert stood is not None
+    return stood
+
+
+def way_of(frames: int, *, leaves_s: float = np.inf, hidden_s: tuple[float, float] = (9.0, 9.0)) -> FloatArray:
+    """A van that stands in one place, accelerates along x from some instant on, and is hidden for some time."""
+    stamp_s = np.arange(frames) / 10.0
+    way = np.column_stack([0.75 * np.maximum(stamp_s - leaves_s, 0.0) ** 2, np.zeros(frames)])
+    way[(stamp_s > hidden_s[0]) & (stamp_s < hidden_s[1])] = np.nan
+    return way
+
+
+def test_a_van_that_something_hides_as_it_leaves_has_left() -> None:
+    """It gets another track 2.5 m ahead of its place, where its own body would still be if it stood there."""
+    stood = stood_of(way_of(60, leaves_s=3.0, hidden_s=(3.5, 4.8)))
+    assert stood.until_s.tolist() == [pytest.approx(4.15, abs=0.06)]  # half way between 3.5 and 4.8 s
+    assert np.isnan(stood.since_s).all()
+    back = stood_of(way_of(60, leaves_s=3.0, hidden_s=(3.5, 4.8))[::-1])
+    assert back.since_s.tolist() == [pytest.approx(1.75, abs=0.06)]
+    assert np.isnan(back.until_s).all()
+
+
+def test_a_van_that_is_hidden_soon_after_it_left_has_left() -> None:
+    """It is seen 1.8 m off its place, in the median of its last ones: more than errors explain, since it moves."""
+    stood = stood_of(way_of(60, leaves_s=2.6, hidden_s=(4.3, 9.0)))
+    assert stood.until_s.tolist() == [pytest.approx(3.0, abs=0.4)]
+
+
+def test_what_drives_past_ends_no_stay() -> None:
+    """Half a metre beside it, or so near that errors explain it, nor through its place, where the two are boxes that
+    were seen together, or much later.
+    """
+    stands, passes = way_of(60, hidden_s=(2.0, 9.0)), np.column_stack([3.0 * np.arange(-30, 30) / 10.0, np.zeros(60)])
+    for off_m in (2.5, -2.5, 1.85):
+        stood = stood_of(stands, passes + np.array([0.0, off_m]))
+        assert np.isnan(stood.until_s).tolist() == [True]
+    assert np.isnan(stood_of(stands, passes).until_s).tolist() == [True]  # it was elsewhere while the van stood
+    behind = way_of(60, leaves_s=2.5) - np.array([6.0, 0.0])  # it stood when the van was seen last
+    until_s = stood_of(stands, behind).until_s
+    assert np.sort(until_s).tolist() == [pytest.approx(2.85, abs=0.4), pytest.approx(np.nan, nan_ok=True)]
+    late = np.full((120, 2), np.nan)
+    late[60:] = passes
+    assert np.isnan(stood_of(way_of(120, hidden_s=(2.0, 20.0)), late).until_s).tolist() == [True]
+
+
+def test_a_box_that_wanders_about_its_place_has_not_left() -> None:
+    """It has a second track that seems to move, but where errors may put what stands there."""
+    wanders = np.full((60, 2), np.nan)
+    wanders[17:27] = np.column_stack([np.linspace(-0.7, 0.7, 10), np.zeros(10)])
+    stood = stood_of(way_of(60, hidden_s=(2.0, 9.0)), wanders)
+    assert (stood.p_static[-6:] < 0.5).all()  # these are later than its last one
+    assert np.isnan(stood.until_s).tolist() == [True]
+
+
 def test_what_the_tracker_took_for_rest_is_forgotten_unless_it_was_long() -> None:
     """Of this recording; what earlier ones say stays."""
     tracker = Tracker(boxes=True)

@@ -24,7 +24,9 @@ class StillConfig(Section):
     fewest: Count = rule(4, "... and detections that it takes")
     p_stands: Share = rule(0.9, "probability from which an object is taken to be static")
     same_m: Positive = rule(0.5, "stays this close are one [m]")
-    elsewhere_m: Positive = rule(2.0, "what left was farther away than this [m]")
+    elsewhere_m: Positive = rule(2.0, "what left was farther away than this [m] ...")
+    sure_sigmas: Positive = rule(3.0, "... or moves where it is farther off its place than so many standard deviations")
+    hidden_s: NotNegative = rule(5.0, "what leaves while it is hidden is seen again within this time [s]")
     when_s: NotNegative = rule(0.5, "when a thing came to rest, or left, is known to within this to both sides [s]")
 
 

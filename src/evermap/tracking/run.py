@@ -222,7 +222,8 @@ def _find_standing(
     range_m = np.zeros(len(frame))
     if table.sensor_m is not None:
         range_m = np.linalg.norm(position_m - table.sensor_m[frame], axis=1)
-    stood = standing(stamp_s, position_m, range_m, track_of_detection, limit, config.still)
+    assert table.box is not None
+    stood = standing(stamp_s, position_m, range_m, table.box[rows], track_of_detection, limit, config.still)
     mine = [np.flatnonzero(stood.stay == k) for k in range(len(stood.track))]
     classes = [class_id[one][class_id[one] != UNKNOWN] for one in mine]
     ends = np.array([stamp_s[one[[0, -1]]] for one in mine]).reshape(-1, 2)

@@ -3,6 +3,10 @@
 Over a window the velocity is a robust line through the detections, whose errors are alike for about a second: ten
 detections of it are hardly more than two. That it stands is a special case, velocity zero but for what a detector
 makes of a changing view; the ratio of the two densities is the Bayes factor (Dickey 1971).
+
+A stay ended where its object was seen to move away. One that something hides as it leaves gets another track when it
+is seen again: two bodies are never in one spot, so what turns up and moves within the room of a box, beside its place,
+is that box.
 """
 
 from __future__ import annotations
@@ -68,8 +72,8 @@ def join_stood(parts: Sequence[Stood], position_m: FloatArray, settings: StillCo
 
 
 def standing(
-    stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, track: IntArray, speed_mps: FloatArray,
-    settings: StillConfig,
+    stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, box: FloatArray, track: IntArray,
+    speed_mps: FloatArray, settings: StillConfig,
 ) -> Stood:  # fmt: skip
     """Return the static tracks and their stays.
 
@@ -77,6 +81,7 @@ def standing(
         stamp_s: (M,) of detections, in order of time.
         position_m: (M, 3) where they are in the world.
         range_m: (M,) how far away they were.
+        box: (M, 4) length, width, height [m] and heading [rad].
         track: (M,) what they are of, or `UNKNOWN`.
         speed_mps: (M,) above which each moves.
         settings: of velocities, and how long a stay lasts.
@@ -98,9 +103,10 @@ def standing(
             p = _p_static(when[part], at[part], sigma[part], limit, settings) if _enough(when[part], settings) else 0.0
             if p > settings.p_stands:
                 stay[mine[part]] = len(rows)
-                rows.append((name, p, *_ends(part, when, at, settings)))
+                rows.append((name, p, *_ends(part, when, at, sigma, p_static[mine] < 0.5, settings)))
     columns = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    return Stood(stay, p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
+    stood = Stood(stay, p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
+    return _with_room_taken(stood, stamp_s, position_m[:, :2], sigma_m, box, track, settings)
 
 
 def long_enough(stamp_s: FloatArray, track: IntArray, settings: StillConfig) -> IntArray:
@@ -199,12 +205,70 @@ def _stays(still: BoolArray, stamp_s: FloatArray, at: FloatArray, settings: Stil
     return found
 
 
-def _ends(part: IntArray, stamp_s: FloatArray, at: FloatArray, settings: StillConfig) -> tuple[float, float]:
-    """Return begin and end of a stay of an object that was clearly elsewhere before and after; nan otherwise."""
+def _with_room_taken(
+    stood: Stood, stamp_s: FloatArray, at: FloatArray, sigma_m: FloatArray, box: FloatArray, track: IntArray,
+    settings: StillConfig,
+) -> Stood:  # fmt: skip
+    """Return stays with ends that follow from what moves in their room shortly before, or after, they were seen.
+
+    It is not the object at its place, misjudged, but beside it, and deeper in its room than errors explain. What was
+    seen elsewhere meanwhile is another one.
+    """
+    since_s, until_s = stood.since_s.copy(), stood.until_s.copy()
+    moves = np.flatnonzero(stood.p_static < 0.5)
+    beyond_m = settings.sure_sigmas * sigma_m[moves]
+    of = np.unique(track, return_inverse=True)[1].ravel()
+    first_s, last_s = np.full(len(track), np.inf), np.full(len(track), -np.inf)
+    np.minimum.at(first_s, of, stamp_s)
+    np.maximum.at(last_s, of, stamp_s)
+    for k in range(len(stood.track)):
+        mine = np.flatnonzero(stood.stay == k)
+        here, size_m = np.median(at[mine], axis=0), np.median(box[mine, :2], axis=0)
+        axis = 0.5 * float(np.angle(np.exp(2j * box[mine, 3]).sum()))
+        away_m = np.linalg.norm(at[moves] - here, axis=1)
+        near = (away_m > settings.same_m + beyond_m) & (away_m < 0.5 * (size_m.sum() + box[moves, :2].sum(axis=1)))
+        near &= track[moves] != stood.track[k]
+        near[near] = _depth_m(at[moves[near]] - here, box[moves[near]], size_m, axis) > beyond_m[near]
+        rows = moves[near]
+        for ends, is_after in ((since_s, False), (until_s, True)):
+            edge_s = float(stamp_s[mine[-1 if is_after else 0]])
+            lag_s = np.abs(stamp_s[rows] - edge_s)
+            apart = first_s[of[rows]] > edge_s if is_after else last_s[of[rows]] < edge_s
+            within = rows[apart & (lag_s < settings.hidden_s)]
+            if len(within) >= settings.fewest and np.isnan(ends[k]):
+                ends[k] = 0.5 * (edge_s + float(stamp_s[within[0 if is_after else -1]]))
+    return stood._replace(since_s=since_s, until_s=until_s)
+
+
+def _depth_m(off_m: FloatArray, box: FloatArray, size_m: FloatArray, axis_rad: float) -> FloatArray:
+    """Return by how much boxes (K, 4), off by (K, 2), overlap a rectangle of a size (2,) along an axis: the least shift
+    that parts them, negative where they are apart (separating axes).
+    """
+    turn = box[:, 3] - axis_rad
+    depth = np.full(len(box), np.inf)
+    for along, own in ((np.full(len(box), axis_rad), True), (box[:, 3], False)):
+        for k in (0, 1):
+            way = along + 0.5 * np.pi * k
+            gap = np.abs(off_m[:, 0] * np.cos(way) + off_m[:, 1] * np.sin(way))
+            straight, across = (size_m[k], box[:, :2]) if own else (box[:, k], np.tile(size_m, (len(box), 1)))
+            along_way, beside = across[:, k], across[:, 1 - k]
+            half = 0.5 * (straight + along_way * np.abs(np.cos(turn)) + beside * np.abs(np.sin(turn)))
+            depth = np.minimum(depth, half - gap)
+    return depth
+
+
+def _ends(
+    part: IntArray, stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, moves: BoolArray, settings: StillConfig
+) -> tuple[float, float]:
+    """Return begin and end of a stay of an object that was clearly elsewhere before and after; nan otherwise.
+
+    What moves (K,) is elsewhere as soon as errors do not explain where it is.
+    """
     here, found = np.median(at[part], axis=0), [np.nan, np.nan]
+    least_m = np.where(moves, settings.same_m + settings.sure_sigmas * sigma, np.inf)
+    beyond_m = np.linalg.norm(at - here, axis=1) - np.minimum(least_m, settings.elsewhere_m)
     for k, (outside, beside) in enumerate(((slice(0, part[0]), part[0] - 1), (slice(part[-1] + 1, None), part[-1]))):
-        away = np.linalg.norm(at[outside] - here, axis=1)
-        fewest = settings.fewest
-        if len(away) >= fewest and float(np.median(np.sort(away)[-fewest:])) > settings.elsewhere_m:
+        fewest, away_m = settings.fewest, beyond_m[outside]
+        if len(away_m) >= fewest and float(np.median(np.sort(away_m)[-fewest:])) > 0.0:
             found[k] = 0.5 * float(stamp_s[beside] + stamp_s[beside + 1])
     return found[0], found[1]

@@ -49,8 +49,14 @@ def views_from(pose: FloatArray, frames: int, stamp_s: float, before: Views | No
     return (before or Views.empty()).seen_from(np.tile(pose, (frames, 1)), stamp_s)
 
 
-def come(before: LivingMap, *, stamp_s: float = 21_000.0, seen_from_m: FloatArray | None = None) -> Arrivals:
-    """A session that finds landmark 7 at `NEW_M`, from `seen_from_m`."""
+def come(
+    before: LivingMap,
+    *,
+    stamp_s: float = 21_000.0,
+    seen_from_m: FloatArray | None = None,
+    p_hidden: FloatArray | None = None,
+) -> Arrivals:
+    """A session that finds landmark 7 at `NEW_M`, from `seen_from_m`; what it says of closed lines, if anything."""
     after = replace(next_map(before, found([7], [NEW_M.tolist()])).living, stamp_s=stamp_s)
     row = int(np.flatnonzero(after.places.landmark_id == 7)[0])
     site = int(np.searchsorted(after.sites.site_id, after.places.site_id[row]))
@@ -61,7 +67,8 @@ def come(before: LivingMap, *, stamp_s: float = 21_000.0, seen_from_m: FloatArra
     rows = SiteLooks(np.array([stamp_s]), np.array([clique]), np.array([site]), np.zeros(1, np.int64), one)
     sight = np.zeros(len(np.unique(after.sites.clique_id)), dtype=np.int64)
     lines, share = nominal_lines(np.ones(1)), np.ones(len(sight))
-    looks = PlaceLooks(rows, np.array([row]), cell, lines, one, one, sight, np.zeros(2), share)
+    p_hidden = before.sightlines.p_hidden if p_hidden is None else p_hidden
+    looks = PlaceLooks(rows, np.array([row]), cell, lines, one, one, sight, np.zeros(2), share, p_hidden=p_hidden)
     told = arrivals(before, after, after.stamp_s, looks, SENSOR)
     assert told.site.tolist() == [site]
     return told
@@ -84,6 +91,16 @@ def test_the_odds_of_an_arrival_are_those_by_hand(frames: int, past: bool) -> No
     told = come(before, seen_from_m=None if past else EYE[:2])
     assert told.looked_s.tolist() == [900.0]
     odds = odds_of_a_newcomer(frames, 0.8, 21_000.0 - 900.0, before.sightlines.p_hidden[2 if past else 0])
+    assert told.p_appeared[0] == pytest.approx(odds / (1.0 + odds), rel=1e-6)
+
+
+@pytest.mark.parametrize("past", [False, True])
+def test_how_many_lines_are_closed_is_what_the_new_session_says_too(past: bool) -> None:
+    """Where it sees all that was seen before, few lines were closed between the two."""
+    before = replace(a_map(behind_seen=past), views=views_from(EYE, 60, 900.0))
+    p_hidden = np.array([0.01, 0.5, 0.04])
+    told = come(before, seen_from_m=None if past else EYE[:2], p_hidden=p_hidden)
+    odds = odds_of_a_newcomer(60, 0.8, 21_000.0 - 900.0, p_hidden[2 if past else 0])
     assert told.p_appeared[0] == pytest.approx(odds / (1.0 + odds), rel=1e-6)
 
 

@@ -181,6 +181,9 @@ def test_how_many_doors_are_shut_is_what_the_others_say(missed: tuple[int, ...])
     for landmark in missed:
         by_hand = share_closed(4.0 - len(missed), len(missed) - 1)
         assert hidden_of(living, looks, landmark) == pytest.approx(by_hand, rel=1e-4)
+    # of what none of them is, all of them say it; and nothing of lines with a witness, or that were unknown
+    by_all = share_closed(4.0 - len(missed), len(missed))
+    assert looks.p_hidden.tolist() == pytest.approx([by_all, *P_HIDDEN[1:]], rel=1e-3)
 
 
 def test_what_has_a_witness_is_hidden_by_itself() -> None:

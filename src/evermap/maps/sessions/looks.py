@@ -10,8 +10,8 @@ this place, it came after it with odds
 
 since the age of what one comes upon is distributed as a stay is, if hazards are constant (which of them is what is not
 known of a class); several sessions are weighed together. Without a look the map grew, and nothing has changed. A line
-along which it is seen now is clear, and was so then as probably as any clear line is from session to session; one past
-it is near the line to it only.
+along which it is seen now is clear, and was so then as probably as any clear line is from session to session: as this
+session says, too, of the lines that were clear then. One past it is near the line to it only.
 """
 
 from __future__ import annotations
@@ -104,6 +104,8 @@ class PlaceLooks:
         unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
         share: (C,) what each clique counts for how many are hidden: those looked at from one place count as one.
         rate: how often the session detects, over what lines of sight lead to expect.
+        p_hidden: (3,) probability that a place is hidden for a session, as `SightLines.p_hidden`, by earlier ones and
+            all that this one looked at.
     """
 
     rows: SiteLooks
@@ -116,6 +118,7 @@ class PlaceLooks:
     unwitnessed: FloatArray
     share: FloatArray
     rate: float = 1.0
+    p_hidden: FloatArray = field(default_factory=lambda: np.array(SightConfig().p_hidden))
 
 
 def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: LivingConfig) -> PlaceLooks:
@@ -147,8 +150,8 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     if not config.learn_sight:
         everything = np.ones(len(rows), dtype=np.bool_)
         sight = np.zeros(len(cliques), dtype=np.int64)
-        lines = nominal_lines(p_nominal, rules)
-        return PlaceLooks(rows, place, cell, lines, everything, settled, sight, np.zeros(2), np.ones(len(cliques)))
+        lines, share, p_hidden = nominal_lines(p_nominal, rules), np.ones(len(cliques)), living.sightlines.p_hidden
+        return PlaceLooks(rows, place, cell, lines, everything, settled, sight, np.zeros(2), share, 1.0, p_hidden)
     names = places.site_id, places.landmark_id
     before, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
     rate = _rate(rows, before.p_detect, seen_before & (p_before >= rules.clear), len(living.sites), rules)
@@ -165,7 +168,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
     was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
     unwitnessed = _unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
-    counts, sight, p_hidden, share = _hidden(
+    counts, sight, p_hidden, share, of_kind = _hidden(
         living,
         p_start,
         rows,
@@ -176,7 +179,7 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
         settings,
     )
     lines = lines.at(rate, rules.highest_rate)._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
-    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, share, rate)
+    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, share, rate, of_kind)
 
 
 def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int, rules: SightConfig) -> float:
@@ -223,9 +226,9 @@ def _hidden(
     unknown: BoolArray,
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
-) -> tuple[BoolArray, IntArray, FloatArray, FloatArray]:
-    """Return looks that count, the (C,) state of the lines to each clique, its (C,) probability of being hidden, and
-    what (C,) each counts among those that were looked at from the same place.
+) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return looks that count, the (C,) state of the lines to each clique, its (C,) probability of being hidden, what
+    (C,) each counts among those that were looked at from the same place, and `PlaceLooks.p_hidden`.
 
     By masks (N,) of looks along clear lines, of those with a sighting nearby or behind, and of unknown lines.
 
@@ -253,14 +256,14 @@ def _hidden(
     alone = (hits == 0) & (sight == 0) & (n_clear > 0)
     near &= alone[:, None] & alone
     np.fill_diagonal(near, True)
-    of_clique = _p_hidden(living.sightlines, sight, looked, hits > 0, p_gone, share, near)
+    of_clique, of_kind = _p_hidden(living.sightlines, sight, looked, hits > 0, p_gone, share, near)
     missed = np.flatnonzero(counts & ~rows.hit)
     eye, place_m = ends(missed)
     of_clique = of_clique ** _sides(rows.clique[missed], eye - place_m, n, settings)
     np.fill_diagonal(near, False)
     together = np.exp(near @ np.log(p_gone))
     of_clique = np.where(alone, of_clique / (of_clique + (1.0 - of_clique) * together), of_clique)
-    return counts, sight, of_clique, share
+    return counts, sight, of_clique, share, of_kind
 
 
 def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
@@ -282,8 +285,9 @@ def _p_hidden(
     p_gone: FloatArray,
     share: FloatArray,
     near: BoolArray,
-) -> FloatArray:
-    """(C,) probability of being hidden, by what earlier sessions say of such lines, and this one by all other cliques.
+) -> tuple[FloatArray, FloatArray]:
+    """(C,) probability of being hidden, by what earlier sessions say of such lines, and this one by all other cliques;
+    and (3,) by all cliques, of a place that is none of them.
 
     Of so many lines a share `q` is closed, beta distributed. One that shows a clique is open, `1 - q`; one along which
     a clique was missed is closed, or it is gone: `q (1 - p_gone) + p_gone`. What is looked at from one place counts as
@@ -298,7 +302,8 @@ def _p_hidden(
         share: (C,) what each counts.
         near: (C, C) what is left out for each: itself, and what is missed along with it.
     """
-    p_hidden = lines.p_hidden[sight]
+    of_kind = lines.p_hidden
+    p_hidden = of_kind[sight]
     log_q, log_open = -np.logaddexp(0.0, -LOGITS), -np.logaddexp(0.0, LOGITS)
     q = np.exp(log_q)
     hidden, shown = lines.closed
@@ -307,10 +312,12 @@ def _p_hidden(
         missed, n_shown = np.flatnonzero(mine & looked & ~seen), share[mine & looked & seen].sum()
         fit = share[missed, None] * np.log(q * (1.0 - p_gone[missed, None]) + p_gone[missed, None])
         log_p = hidden[kind] * log_q + (shown[kind] + n_shown) * log_open
-        log_p = log_p + fit.sum(axis=0) - near[np.ix_(mine, missed)] @ fit
+        log_p = log_p + fit.sum(axis=0)
+        log_p = np.vstack([log_p, log_p - near[np.ix_(mine, missed)] @ fit])
         weight = np.exp(log_p - log_p.max(axis=1, keepdims=True))
-        p_hidden[mine] = (weight @ q) / weight.sum(axis=1)
-    return p_hidden
+        mean = (weight @ q) / weight.sum(axis=1)
+        of_kind[kind], p_hidden[mine] = mean[0], mean[1:]
+    return p_hidden, of_kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,7 +363,7 @@ def arrivals(
     cliques, row = clique_rows(after.sites)
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
-    cells, (p_hidden, _, p_hidden_unknown) = after.sightlines.cell_m, before.sightlines.p_hidden.tolist()
+    cells, (p_hidden, _, p_hidden_unknown) = after.sightlines.cell_m, looks.p_hidden.tolist()
     rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
         parts, places = [], np.flatnonzero(site_of_place == site)
