@@ -11,11 +11,11 @@ import pytest
 from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.errors import NumericalError
-from evermap.explain import competition
 from evermap.explain.causes import Inputs, Suspect, list_suspects
-from evermap.explain.competition import SessionSolution, Solve, Trial, _screen_pairs
 from evermap.explain.evidence import Screen, optimum_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
+from evermap.explain.screens import screen_pairs
+from evermap.explain.trial import Budget, SessionSolution, Solve, Trial, refine, solve_trial
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
@@ -336,7 +336,7 @@ def trial_under(inputs: Inputs, suspect: Suspect, state: float) -> tuple[Trial[V
         visit = session.solved(given.recording, Config(), given.prior_map, ())
         return SessionSolution(visit, session.solution_of(visit), visit.concluded())
 
-    trial = competition._solve_trial(inputs, (), suspect, state, solve_under, competition._Budget(1))
+    trial = solve_trial(inputs, (), suspect, state, solve_under, Budget(1))
     assert trial is not None
     return trial, solve_under
 
@@ -356,8 +356,8 @@ def test_a_cause_is_refined_until_it_leaves_nothing_to_changes(
     suspect = next(one for one in list_suspects(inputs) if (one.code, one.subject) == name)
     trial, solve_under = trial_under(inputs, suspect, state)
     assert trial.solution.result.changes != ()
-    budget = competition._Budget(6)
-    found = competition._refined(trial, inputs, (), solve_under, budget)
+    budget = Budget(6)
+    found = refine(trial, inputs, (), solve_under, budget)
     assert found.solution.result.changes == ()
     assert found.taken[-1].state == pytest.approx(true, abs=within)
     assert budget.left > 0  # it stopped where no step is long
@@ -426,6 +426,6 @@ def test_clocks_that_are_right_or_nearly_so_are_left_to_scores(world: World) -> 
         inputs = Inputs.of(recording, None)
         clocks = [one for one in list_suspects(inputs) if one.code == "clock"]
         assert clocks
-        assert _screen_pairs(inputs, clocks, Config().slam) == []
+        assert screen_pairs(inputs, clocks, Config().slam) == []
         near = replace(recording.frames, stamp_s=recording.frames.stamp_s + 0.08)
-        assert _screen_pairs(Inputs.of(replace(recording, frames=near), None), clocks, Config().slam) == []
+        assert screen_pairs(Inputs.of(replace(recording, frames=near), None), clocks, Config().slam) == []

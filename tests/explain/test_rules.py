@@ -10,8 +10,10 @@ import pytest
 
 from evermap.config import SlamConfig
 from evermap.explain import competition
+from evermap.explain.answer import list_causes
 from evermap.explain.causes import Suspect
-from evermap.explain.competition import FAR, Taken, Trial
+from evermap.explain.screens import FAR
+from evermap.explain.trial import Asked, Taken, Trial, _state_evidence, _with_last
 
 
 def suspect(code: str = "tag-size", subject: str = "5", sigma: float = 0.3, p: float = 0.01) -> Suspect:
@@ -80,19 +82,19 @@ def test_a_cause_must_explain_something_that_was_asked(
     monkeypatch.setattr(competition, "find_symptoms", lambda result, *_: (before, after)[result])
     monkeypatch.setattr(competition, "count_changed", lambda result: changed[result])
     monkeypatch.setattr(competition, "share_rejected", lambda result: rejected[result])
-    monkeypatch.setattr(competition, "_find_score", lambda solution, _: unexplained[solution.result])
+    monkeypatch.setattr("evermap.explain.trial.find_score", lambda solution, _: unexplained[solution.result])
     assert competition._relieves(now, best, SlamConfig()) is relieves
 
 
 def test_a_state_costs_how_unusual_it_is_and_how_well_it_is_known() -> None:
     one = suspect(sigma=0.3)
-    unknown, usual = (competition._state_evidence(Taken(one, state)) for state in (0.6, 0.0))
+    unknown, usual = (_state_evidence(Taken(one, state)) for state in (0.6, 0.0))
     assert usual == pytest.approx(one.log_p)
     assert unknown == pytest.approx(one.log_p - 2.0)
-    known = competition._state_evidence(Taken(one, 0.6, 100.0 / 0.3**2))
+    known = _state_evidence(Taken(one, 0.6, 100.0 / 0.3**2))
     assert known == pytest.approx(unknown - math.log(10.0))
     before = trial(7.0, Taken(one, 0.6))
-    after = competition._with_last(before, Taken(one, 0.6, 100.0 / 0.3**2))
+    after = _with_last(before, Taken(one, 0.6, 100.0 / 0.3**2))
     assert after.evidence == pytest.approx(7.0 - math.log(10.0))
 
 
@@ -101,17 +103,17 @@ def test_a_cause_names_what_explains_the_same_without_it() -> None:
     size, wheels = (Taken(suspect(code, code), 0.05) for code in ("tag-size", "odometry-scale"))
     base, best = trial(-50.0, result=nothing), trial(0.0, size, result=nothing)
     other, both = trial(-1.0, wheels, result=nothing), trial(-0.5, size, wheels, result=nothing)
-    (found,) = competition._causes(best, [base, best, other], base)
+    (found,) = list_causes(best, [base, best, other], base)
     assert found.probability == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))
     assert found.instead == str(wheels.state)
     assert other.beats(best) == pytest.approx(-1.0)  # the same price
-    assert competition._causes(best, [base, best], base)[0].instead == ""  # nothing is off
-    assert competition._causes(best, [best, both], None)[0].instead == ""
-    by_code = {one.code: one.instead for one in competition._causes(both, [base, best, other, both], base)}
+    assert list_causes(best, [base, best], base)[0].instead == ""  # nothing is off
+    assert list_causes(best, [best, both], None)[0].instead == ""
+    by_code = {one.code: one.instead for one in list_causes(both, [base, best, other, both], base)}
     assert by_code == {"tag-size": str(wheels.state), "odometry-scale": str(size.state)}
 
 
-def ranked(plain: competition.Asked, linear: competition.Asked, *, best: Trial[Any] | None) -> list[list[str]]:
+def ranked(plain: Asked, linear: Asked, *, best: Trial[Any] | None) -> list[list[str]]:
     """Names of what is asked, turn by turn."""
     turns = competition._rank(best, cast("Any", None), [], SlamConfig(), (lambda *_: plain, lambda *_: linear))
     return [[one.code for _, one, _ in turn] for turn in turns]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from evermap.config import SlamConfig
 from evermap.explain.causes import Inputs
-from evermap.explain.competition import find_put_right
+from evermap.explain.put_right import find_put_right
 from evermap.explain.shape import compare_shapes
 from evermap.types import Cause, Landmarks, ParameterEstimate
 

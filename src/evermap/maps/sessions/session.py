@@ -11,9 +11,11 @@ import numpy as np
 from evermap.config import Config, LivingConfig
 from evermap.errors import DataError, NumericalError
 from evermap.existence.sites import Evidence
+from evermap.explain.answer import in_given_units
 from evermap.explain.causes import Inputs
-from evermap.explain.competition import SessionSolution, explain, in_given_units
+from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
+from evermap.explain.trial import SessionSolution
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Places, Stays

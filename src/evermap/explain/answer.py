@@ -1,0 +1,94 @@
+"""The answer of the competition: causes with probabilities, and the result in the units that were given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from evermap.explain.trial import Taken, Trial, VisitT
+from evermap.types import Cause, ParameterEstimate, SlamResult, is_in_space
+
+CLOCK = "clock"
+"""Cause of stamps that are late."""
+
+
+def find_ratio(state: ParameterEstimate) -> float:
+    """Return a scale as a ratio: the slope of ranges is less one."""
+    return state.value + (1.0 if state.name == "range_slope" else 0.0)
+
+
+OWN_STATES = {
+    "odometry-scale": (("odometry_forward_scale", 1.0), ("odometry_scale", 1.0)),
+    "turn-scale": (("odometry_turn_scale", 1.0),),
+    "range-scale": (("range_scale", -1.0), ("range_slope", -1.0)),
+}
+"""Calibration states that are the same number as a cause's, and the sign with which their logarithms add to it."""
+
+
+def in_given_units(trial: Trial[VisitT]) -> SlamResult:
+    """Return the result of a trial, its calibration states as they are of the recording that was given."""
+    late = [one for one in trial.taken if one.suspect.code == CLOCK and not is_in_space(trial.inputs.recording)]
+    factor = {
+        name: math.exp(sign * one.state) for one in trial.taken for name, sign in OWN_STATES.get(one.suspect.code, ())
+    }
+    states = [
+        replace(
+            state, value=state.value + (factor[state.name] - 1.0) * find_ratio(state),
+            sigma=state.sigma * factor[state.name],
+        )
+        if state.name in factor
+        else _with_delay(state, late) if late and state.name == "odometry_delay_s" else state
+        for state in trial.solution.result.parameters
+    ]  # fmt: skip
+    return replace(trial.solution.result, parameters=tuple(states))
+
+
+def _with_delay(delay: ParameterEstimate, late: Sequence[Taken]) -> ParameterEstimate:
+    """Return the delay of the odometry's stamps against those that were given of the sensor, which were late."""
+    by_s, variance = sum(one.state for one in late), sum(1.0 / one.information for one in late)
+    return replace(delay, value=delay.value - by_s, sigma=max(delay.sigma, math.sqrt(variance)), p_needed=1.0)
+
+
+def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
+    """Return the state of a cause and its standard deviation, with what the estimator's own state adds to it."""
+    state, sigma = taken.state, taken.information**-0.5 if taken.information > 0.0 else math.nan
+    own = {one.name: one for one in result.parameters}
+    for name, sign in OWN_STATES.get(taken.suspect.code, ()):
+        if name in own and not own[name].fixed and (ratio := find_ratio(own[name])) > 0.0:
+            state += sign * math.log(ratio)
+            sigma = min(sigma, own[name].sigma / ratio) if own[name].sigma > 0.0 else sigma
+    return state, sigma
+
+
+def _say(trial: Trial[VisitT]) -> str:
+    """Return the causes of a trial in words."""
+    return "; ".join(one.suspect.say(_with_own_state(one, trial.solution.result)[0]) for one in trial.taken)
+
+
+def list_causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[VisitT] | None) -> tuple[Cause, ...]:
+    """Return the causes of the best trial, with their probabilities among all that was weighed."""
+    if not best.taken:
+        return ()
+    relative = np.array([trial.beats(best) for trial in weighed])
+    share = np.exp(np.minimum(relative, 0.0))
+    share /= max(float(share.sum()), 1e-300)
+    found = []
+    gained = math.nan if base is None else best.beats(base)
+    for one in best.taken:
+        name = one.suspect.code, one.suspect.subject
+        holds = np.array([any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed])
+        other = None if holds.all() else weighed[int(np.argmax(np.where(holds, -math.inf, relative)))]
+        suspect = one.suspect
+        state, sigma = _with_own_state(one, best.solution.result)
+        value = suspect.shown(state) if suspect.is_continuous else math.nan
+        scale = abs(suspect.shown(state + 1e-6) - suspect.shown(state)) / 1e-6
+        found.append(
+            Cause(
+                suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
+                float(share[holds].sum()), suspect.fix(state), gained, "" if other is None else _say(other),
+            )
+        )  # fmt: skip
+    return tuple(sorted(found, key=lambda cause: -cause.probability))
