@@ -4,7 +4,7 @@ Five robots take turns in a simulated building (20 sessions), each of them calib
 one's readings are falsified, or those of several. Precision and recall are those of the landmarks that the map believes
 in after the first round, on average over the sessions, and so is the log loss of their existence.
 
-    python -m benchmarks.liars                            # the table of docs/server.md
+    python -m benchmarks.liars                            # the table of docs/server-robots.md
     python -m benchmarks.liars --seeds 0 --lies nothing "ranges 10 %"
     python -m benchmarks.liars --seeds 0 1 2 3 4 5 --session-s 60 --liars 2 --lies "detects a third" "detects a seventh"
 """

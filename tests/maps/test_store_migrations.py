@@ -159,7 +159,7 @@ def test_a_newer_schema_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_the_page_lists_every_table_and_column(repository: Path) -> None:
-    page = (repository / "docs" / "maps.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "map-store.md").read_text(encoding="utf-8")
     rows = [line.split("|")[1:4] for line in page.splitlines() if line.startswith("| `") and line.count("|") == 4]
     shown = {name.strip(" `"): set(re.findall(r"`(\w+)`", columns)) for name, _, columns in rows}
     told_in_words = {"store": {"created_at", "evermap_version"}}

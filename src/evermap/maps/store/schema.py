@@ -1,6 +1,6 @@
 """The tables of a map store in portable SQL, and the migrations from one schema to the next.
 
-`docs/maps.md` says what is in the tables. A store is brought up to date when it is opened, in one transaction.
+`docs/map-store.md` says what is in the tables. A store is brought up to date when it is opened, in one transaction.
 """
 
 from __future__ import annotations
