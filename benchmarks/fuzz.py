@@ -720,7 +720,7 @@ def _configs() -> tuple[bytes, ...]:
 
     return (
         to_toml(Config()).encode(),
-        b'[slam]\nseed = 3\nmethod = "joint"\n[slam.modes]\nrounds = 4\n[sensor]\nrange_max_m = 12.0\n',
+        b'[slam]\nseed = 3\nmethod = "joint"\n[slam.modes]\nmcts_budget = 4\n[sensor]\nrange_max_m = 12.0\n',
     )
 
 

@@ -47,6 +47,7 @@ def apart(one: Any, other: Any) -> float:
     return max(float(np.nanmax(np.linalg.norm(a - b, axis=1))) for a, b in both)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("race", ["isam2", "batch"])
 def test_contenders_find_the_same_positions(run: ModuleType, worlds: dict[bool, Any], race: str) -> None:
     ours, theirs = (contender(worlds[False]) for contender in run.CONTENDERS[race])
@@ -189,6 +190,7 @@ def test_the_working_set_and_the_tree_of_the_race_find_the_same(run: ModuleType)
         assert len(near) > 1
 
 
+@pytest.mark.slow
 def test_both_who_race_in_a_known_map_find_the_way(run: ModuleType) -> None:
     """As near to each other as to the truth, and the map has what it says in view."""
     race = run.localize

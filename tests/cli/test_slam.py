@@ -353,7 +353,7 @@ def test_a_setting_that_would_change_nothing_is_refused(
 def test_a_file_of_settings_may_hold_sections_of_other_recordings(in_space: bool, tmp_path: Path) -> None:
     folder = write_template(tmp_path / "template", in_space=in_space)
     settings = tmp_path / "all.toml"
-    settings.write_text("[slam.space]\nsigma_px = 1.0\n[slam.calibration]\np_needed = 0.4\n", encoding="utf-8")
+    settings.write_text("[slam.space]\nsigma_px = 1.0\n[slam.calibration]\nsigma_askew_rad = 0.04\n", encoding="utf-8")
     result = run("slam", folder, "--out", tmp_path / "out", "--config", settings, *QUICK)
     assert result.exit_code == 0, result.stderr
 

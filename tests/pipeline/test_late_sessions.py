@@ -119,9 +119,9 @@ def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: Livi
 
 def test_a_late_session_with_which_a_later_one_is_lost_stays_out(tmp_path: Path) -> None:
     """Neither shows enough of what the other has: the map keeps the one that it has."""
-    days = simulate_building(BuildingConfig(days=8, patrol_s=35.0), 10).sessions
+    days = simulate_building(BuildingConfig(days=8, patrol_s=30.0), 10).sessions
     with open_store(tmp_path / "site.evermap", create=True) as store:
-        fed(store, days[5])
+        fed(store, days[7])
         with pytest.raises(UnbridgedError, match="revision 1 cannot be brought in again: too few"):
             em.enter_session(store, days[2])
         assert store.head() == 1

@@ -92,9 +92,12 @@ def test_independent_residuals_show_no_curves():
 
 @pytest.mark.parametrize("kind", [None, SensorKind.LASER])
 def test_a_range_that_bends_is_taken_for_no_offset(kind):
-    """An offset of -12 mm +- 1 is found if the law of ranges is taken for exact, and everything is off by 1.7 times."""
+    """An offset of -12 mm +- 1 is found if the law of ranges is taken for exact, and everything is off by 1.7 times.
+
+    Where the sensor sits is stated: not to know it costs more than the bend.
+    """
     recording = simulate_laser(LaserWorld(incidence_m=0.03), 0)
-    recording = replace(recording, sensor=replace(recording.sensor, kind=kind))
+    recording = replace(recording, sensor=replace(recording.sensor, kind=kind, sigma_position_m=0.0))
     result = run_slam(recording, Config())
     assert np.all(errors(recording, result) < 1.1 * errors(recording, run_slam(recording, PLAIN)))
     found = {one.name: one for one in result.parameters}["range_bias_m"]
