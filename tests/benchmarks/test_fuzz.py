@@ -9,7 +9,7 @@ import pytest
 from benchmarks import fuzz
 
 FILES = 40
-FEWER = 8
+FEWER = 4
 """Files of kinds that take long to read, in the quick tests."""
 LONG = ("bags", "models", "maps", "old-maps")
 """Beginnings of their names."""

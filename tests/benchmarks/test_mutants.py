@@ -47,6 +47,7 @@ def test_a_mutant_is_the_file_with_one_change() -> None:
         assert changed[0] + 1 >= one.first_line, one
 
 
+@pytest.mark.slow
 def test_what_no_test_notices_survives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

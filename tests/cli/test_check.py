@@ -72,7 +72,9 @@ SPOILS: dict[str, tuple[Spoil, int, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", SPOILS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=pytest.mark.slow) if one == "mixed identities" else one for one in SPOILS]
+)
 def test_check_ends_as_slam_does(name: str, tmp_path: Path) -> None:
     spoil, code, words = SPOILS[name]
     folder = write_native(spoil(patrol()), tmp_path / "recording")

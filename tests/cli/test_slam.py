@@ -358,8 +358,14 @@ def test_a_file_of_settings_may_hold_sections_of_other_recordings(in_space: bool
     assert result.exit_code == 0, result.stderr
 
 
-@pytest.mark.parametrize("in_space", [False, True])
-@pytest.mark.parametrize("column", ["empty", "absent"])
+@pytest.mark.parametrize(
+    ("column", "in_space"),
+    [
+        ("empty", False),
+        ("absent", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("empty", True), ("absent", False))),
+    ],
+)
 def test_a_recording_without_identities(column: str, in_space: bool, tmp_path: Path) -> None:
     """`check` and `slam` tell the option, and with it both accept the recording."""
     folder = write_template(tmp_path / "template", in_space=in_space)

@@ -207,6 +207,7 @@ def test_a_late_session_enters_as_before(tmp_path: Path) -> None:
         assert [item.digest for item in packed.attachments()] == [item.digest for item in plain.attachments()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_killed_at_any_statement_it_leaves_the_map(path: Path) -> None:
     before, data = answers(path), path.read_bytes()

@@ -55,7 +55,11 @@ def told(seed: int, turn_scale: float, *, blind: bool, view_rad: float = np.pi) 
 
 @pytest.mark.parametrize(
     ("turn_scale", "blind", "view_rad"),
-    [pytest.param(0.05, False, np.pi, marks=pytest.mark.slow), (0.1, True, np.pi), (0.1, True, 0.6)],
+    [
+        pytest.param(0.05, False, np.pi, marks=pytest.mark.slow),
+        (0.1, True, np.pi),
+        pytest.param(0.1, True, 0.6, marks=pytest.mark.slow),
+    ],
 )
 def test_poses_are_as_uncertain_as_the_filter_says(turn_scale, blind, view_rad):
     runs = 40

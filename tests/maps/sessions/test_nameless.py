@@ -175,6 +175,7 @@ def test_a_session_of_another_building_is_refused(lived: tuple[BuildingSimulatio
     assert other.living is sessions[0].living or len(other.living.places) == len(sessions[0].living.places)
 
 
+@pytest.mark.slow
 def test_a_late_session_makes_the_map_of_the_right_order(
     lived: tuple[BuildingSimulation, list[Session]], tmp_path: Path
 ) -> None:
