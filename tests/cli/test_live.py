@@ -35,6 +35,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [write_native(recording, folder / f"day{k}") for k, recording in enumerate(found[:3])]
 
 
+@pytest.mark.slow
 def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: Path, sessions: list[Path]) -> None:
     live, slam = tmp_path / "live.evermap", tmp_path / "slam.evermap"
     for number, path in enumerate(sessions):

@@ -22,6 +22,7 @@ def looks_of(durations: list[float], step_s: float, seed: int) -> Looks:
     return Looks.from_rows(np.zeros(len(time_s), dtype=int), time_s, seen, P_ERROR, P_ERROR)
 
 
+@pytest.mark.slow
 def test_a_clockwork_is_told_from_chance() -> None:
     rng = np.random.default_rng(1)
     clockwork = looks_of(list(np.tile([60.0, 300.0], 20) * rng.normal(1.0, 0.01, 40)), 6.0, 2)

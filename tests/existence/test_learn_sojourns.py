@@ -332,6 +332,7 @@ def test_shares_of_days_are_learned_and_later_days_are_added() -> None:
     assert both.of_kind[1] - first.of_kind[1] == pytest.approx(1.0 + 4 * first.model.unusual.still, abs=0.3)
 
 
+@pytest.mark.slow
 def test_learning_goes_on_from_a_model_of_most_of_the_looks() -> None:
     """As good as anew, with nothing else tried: no family that lost before, no typical duration from the start."""
     time, there = truth(Weibull(2.5, 60.0), LogNormal(3.5, 0.4), 7, features=3)

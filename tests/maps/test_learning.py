@@ -182,6 +182,7 @@ def test_order_of_stays_does_not_matter() -> None:
         np.testing.assert_allclose(a.stay.log_survival(DAY_S), b.stay.log_survival(DAY_S), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_forecasts_of_the_next_session_beat_the_general_purpose_prior_and_are_calibrated() -> None:
     """What is there now: will it be there at the next look? Learned day by day, of what was seen until then."""
     general = GeneralPurpose(1.0 / (3650.0 * DAY_S), 1.0 / 3600.0)

@@ -182,6 +182,7 @@ def test_sessions_and_pruning_go_on(path: Path, tmp_path: Path) -> None:
         assert {row[0] for row in listed} == packs.keys()
 
 
+@pytest.mark.slow
 def test_a_late_session_enters_as_before(tmp_path: Path) -> None:
     config = BuildingConfig(days=3, patrol_s=40.0, length_m=14.0, depth_m=13.0, rooms_per_side=1, change_rate=1.0)
     sessions = simulate_building(config, seed=1).sessions
@@ -291,6 +292,7 @@ def test_an_older_evermap_refuses_packs(path: Path, monkeypatch: pytest.MonkeyPa
         open_store(path)
 
 
+@pytest.mark.slow
 def test_revisions_of_a_compact_map_go_into_another_one(path: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.evermap"
     with open_store(path) as store:

@@ -144,6 +144,7 @@ def test_what_was_stopped_is_continued(tmp_path: Path, otherwise: LivingMap, mon
     assert [item.name for item in tmp_path.iterdir() if item.name.startswith(".")] == []
 
 
+@pytest.mark.slow
 def test_a_session_that_comes_meanwhile_is_entered_too(
     site_address: str, tmp_path: Path, otherwise: LivingMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:

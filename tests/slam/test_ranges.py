@@ -126,6 +126,7 @@ def oracle(recording: Recording) -> tuple[float, float]:
     return errors(recording, x[: 3 * n].reshape(-1, 3), stamp_s, x[3 * n :].reshape(-1, 2))
 
 
+@pytest.mark.slow
 def test_the_error_is_near_that_of_an_oracle() -> None:
     found, best = [], []
     for seed in (1, 2, 3):

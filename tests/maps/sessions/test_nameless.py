@@ -110,6 +110,7 @@ def test_the_map_is_as_large_as_that_of_named_landmarks(lived: tuple[BuildingSim
         assert abs(count[0] - count[1]) <= 0.2 * count[1]
 
 
+@pytest.mark.slow
 def test_ids_of_the_recording_are_not_looked_at(lived: tuple[BuildingSimulation, list[Session]]) -> None:
     one, sessions = lived
     again = lived_through([without_ids(recording, NAMELESS) for recording in one.sessions[:2]], NAMELESS)
@@ -135,6 +136,7 @@ def test_what_left_is_believed_in_less_and_what_an_operator_deleted_does_not_com
     assert len(grown) == len(np.setdiff1d(sessions[1].living.members.landmark_id, edited.members.landmark_id))
 
 
+@pytest.mark.slow
 def test_landmarks_without_a_name_keep_company_with_those_that_have_one() -> None:
     """Every other landmark has its name in all sessions; the others get theirs from the map."""
     one, mixed = building(0), Config(slam=FIXED.model_copy(update={"unknown_ids": "empty"}))
