@@ -24,6 +24,9 @@ from evermap_studies.bateman2020.settings import IN_THE_TABLE, LEARNED, NOMINAL,
 
 from .bateman2020_small import P_MISS, small
 
+pytestmark = pytest.mark.slow
+"""Whole studies: `make test-slow` runs them, and the nightly part."""
+
 PAPER = Path(__file__).resolve().parents[3] / "shared" / "papers" / "001_c5df7cde2102ba6a.txt"
 
 METRICS_PROMISED = ("accuracy", "survival_ratio", "brier", "delay_mean")

@@ -37,6 +37,9 @@ from evermap_studies.lifelong.table import as_markdown, verdicts
 from evermap_studies.lifelong.world import DAY_S, World, recorded_world, simulated_world
 from evermap_studies.nielsen2024.runs import recording_of, reference_of, survey_of
 
+pytestmark = pytest.mark.slow
+"""Whole studies: `make test-slow` runs them, and the nightly part."""
+
 SURVEY = Landmarks.at(np.arange(6, 21), np.random.default_rng(1).uniform(-4.0, 4.0, (15, 2)))
 
 

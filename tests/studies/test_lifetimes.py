@@ -28,6 +28,9 @@ from evermap_studies.lifetimes.truth import ESTIMATORS, NAIVE, SHARES, Stays, ch
 from evermap_studies.worlds.moving import Behaviour, MovingClass, MovingWorld, simulate_moving
 from evermap_studies.worlds.patrol_lifetimes import DAY_S, PatrolClass, PatrolPlace, PatrolWorld, simulate_patrols
 
+pytestmark = pytest.mark.slow
+"""Whole studies: `make test-slow` runs them, and the nightly part."""
+
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "presence"
 SMALL_MOVING = MovingWorld(
     classes=(

@@ -25,6 +25,9 @@ from evermap_studies.demo.story import demo_sections
 from evermap_studies.demo.study import run_study
 from evermap_studies.demo.truth import truth_of
 
+pytestmark = pytest.mark.slow
+"""Whole studies: `make test-slow` runs them, and the nightly part."""
+
 SCENARIO = Scenario(days=2, patrol_lengths_s=(40.0, 60.0), wing_opens_day=1, change_rate=3.0)
 SEED = 3
 FILES = ("trajectory.tum", "map.geojson", "true_events.jsonl", "changes.jsonl")
