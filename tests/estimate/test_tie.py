@@ -7,7 +7,7 @@ import pytest
 
 from evermap.estimate.measurement import MeasurementFactors, Tied
 from evermap.estimate.measurements import find_kinds
-from evermap.estimate.tie import tie_measurements, without_frames
+from evermap.estimate.tie import find_nearest, tie_measurements, without_frames
 from evermap.geometry import se3
 from evermap.types import UNKNOWN, FloatArray, Measurements
 
@@ -91,3 +91,8 @@ def test_measurements_among_some_poses_are_those_that_tie_no_other(first: int, e
 def test_what_has_a_frame_of_its_own_is_left_out_where_there_is_another() -> None:
     tables = [table("gnss", [10.0], x_m=[0.0], y_m=[0.0], z_m=[0.0]), table("ranges", [10.0], [3], range_m=[1.0])]
     assert [one.kind for one in without_frames(tables)] == ["ranges"]
+
+
+def test_the_nearest_stamp_is_found_also_beyond_the_ends() -> None:
+    stamps, asked = np.array([0.0, 1.0, 3.0]), np.array([-5.0, 0.4, 0.5, 0.6, 2.0, 2.1, 9.0])
+    assert find_nearest(stamps, asked).tolist() == [0, 0, 1, 1, 2, 2, 2]

@@ -62,6 +62,12 @@ def _instants(
     return row.astype(np.int64), move(stamp_s[row], instant_s)
 
 
+def find_nearest(stamp_s: FloatArray, instant_s: FloatArray) -> IntArray:
+    """Return the row (K,) of the pose whose stamp (N,) is nearest to each instant (K,); of two, the later one."""
+    after = np.clip(np.searchsorted(stamp_s, instant_s), 1, len(stamp_s) - 1)
+    return after - (instant_s - stamp_s[after - 1] < stamp_s[after] - instant_s)
+
+
 def without_frames(tables: Sequence[Measurements]) -> tuple[Measurements, ...]:
     """Return the measurements without those that have a frame of their own: what is laid over others has none."""
     return tuple(table for table in tables if find_kinds()[table.kind].frame is None)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import CheckConfig
+from evermap.estimate.tie import find_nearest
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import FALLS, find_pair_loss
 from evermap.slam.mistakes import HONEST, Mistake, find_motion, off, pairs_of
@@ -270,9 +271,7 @@ def _rays(
     """(M, dim) where detections were made from, (M, dim) unit vectors, (M,) ranges, and (M,) which are known."""
     at, known = positions_in_robot(recording)
     seen_s = recording.frames.stamp_s[recording.detections.frame]
-    near: IntArray = np.clip(np.searchsorted(stamp_s, seen_s), 1, len(stamp_s) - 1)
-    near = near - (seen_s - stamp_s[near - 1] < stamp_s[near] - seen_s)
-    robot = pose[near]
+    robot = pose[find_nearest(stamp_s, seen_s)]
     if is_in_space(recording):
         mounts = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[recording.detections.sensor]
         eye, there = se3.compose(robot, mounts)[:, :3], se3.transform(robot, at)

@@ -18,6 +18,7 @@ from evermap.align.acceptance import MOST_JOINT
 from evermap.align.candidates import Matches
 from evermap.estimate.gauss_newton import Minimum, Steps
 from evermap.estimate.noise import restricted_level
+from evermap.estimate.tie import find_nearest
 from evermap.geometry import se2
 from evermap.slam.batch import (
     ALIGNED_INFORMATION,
@@ -121,20 +122,14 @@ def _find_sightings(
     row = np.zeros_like(pair)
     for r, own in enumerate(merged):
         some = pair == r
-        row[some] = first[r] + _nearest(own, np.broadcast_to(stamp_s[:, None], pair.shape)[some] - start_s[r])
+        row[some] = first[r] + find_nearest(own, np.broadcast_to(stamp_s[:, None], pair.shape)[some] - start_s[r])
     return Encounters(row[:, 0], row[:, 1], pair[:, 0], reading), merged, remarks
 
 
 def _with_instants(own_s: FloatArray, new_s: FloatArray) -> FloatArray:
     """Return instants (N,), and the other, sorted ones that are not among them."""
-    new_s = new_s[np.abs(own_s[_nearest(own_s, new_s)] - new_s) > ONE_INSTANT_S]
+    new_s = new_s[np.abs(own_s[find_nearest(own_s, new_s)] - new_s) > ONE_INSTANT_S]
     return np.sort(np.concatenate([own_s, new_s[np.diff(new_s, prepend=-np.inf) > ONE_INSTANT_S]]))
-
-
-def _nearest(own_s: FloatArray, stamp_s: FloatArray) -> IntArray:
-    """Return rows of the instants (N,) that are nearest to others."""
-    after = np.clip(np.searchsorted(own_s, stamp_s), 1, len(own_s) - 1)
-    return after - (stamp_s - own_s[after - 1] < own_s[after] - stamp_s)
 
 
 def _extend(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:

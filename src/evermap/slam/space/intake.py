@@ -11,6 +11,7 @@ import numpy as np
 
 from evermap.config import SpaceConfig
 from evermap.errors import DataError
+from evermap.estimate.tie import find_nearest
 from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
@@ -535,8 +536,7 @@ def _has_clock_of_frames(recording: SpatialRecording, frame_s: FloatArray) -> bo
 
 def _find_nearest_s(stamp_s: FloatArray, asked_s: FloatArray) -> FloatArray:
     """Return (M,) times from those asked to the nearest of stamps (K,)."""
-    after = np.clip(np.searchsorted(stamp_s, asked_s), 1, len(stamp_s) - 1)
-    return np.minimum(np.abs(stamp_s[after] - asked_s), np.abs(asked_s - stamp_s[after - 1]))
+    return np.abs(stamp_s[find_nearest(stamp_s, asked_s)] - asked_s)
 
 
 def _find_frames(recording: SpatialRecording, seen_in: IntArray, moving: BoolArray) -> PathFrames:
