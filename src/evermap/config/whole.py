@@ -68,11 +68,11 @@ def load_config(
 
 
 def with_rules(config: Config, rules: Mapping[str, Any]) -> Config:
-    """Return `config` with values of rules and keys, by their dotted names: for experiments with the method itself."""
-    content = config.model_dump()
-    for name, value in rules.items():
-        _set(content, name, value, "")
-    return _validate(content, None)
+    """Return `config` with values of rules and keys, by their dotted names: for experiments with the method itself.
+
+    None leaves one as it is.
+    """
+    return _overridden(config, (), rules, "")
 
 
 def _refuse_rules(content: Mapping[str, Any], prefix: tuple[str, ...], path: Path | None) -> None:
