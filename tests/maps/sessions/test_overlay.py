@@ -209,7 +209,7 @@ def test_a_body_taken_apart_pays_for_that_and_for_each_member() -> None:
     one = world(np.random.default_rng(34), [1] * 6 + [3], [1] * 6 + [2], [0] * 7, sigma_m=0.01)
     options = _Options(one.sighted, one.known, agreed(one), USUAL, 0.8)
     whole = np.array([0, 1, 2, 3, 4, 5, 6])
-    parted, each = options.parted(np.array([6]), whole)
+    parted, each = options.take_apart(np.array([6]), whole)
     assert parted.concluded(each).place[6:].tolist() == options.concluded(whole).place[6:].tolist()
     paid = parted.log_probability(each) - options.log_probability(whole)
     assert paid == pytest.approx(np.log(0.2) + 2.0 * one.known.log_p_site[6])

@@ -11,7 +11,6 @@ exact coordinate ascent, one change at a time, from what most landmarks agree on
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -164,7 +163,7 @@ def lay_over(
         return None
     if not (options.is_this_place(chosen) and options.outweighs_the_rest(chosen)):
         return None
-    found = options.concluded(chosen) if best.whole is None else best.mixed()
+    found = options.concluded(chosen) if best.whole is None else best.mix()
     for other in (_search(_Options(sighted, known, rival, settings, p_one_body, options)) for rival in rivals):
         if other.options.n_standing(other.chosen) < 2 or other.score <= best.score - settings.lead_nats:
             continue
@@ -188,7 +187,7 @@ class _Found(NamedTuple):
     score: float
     whole: tuple[Overlay, FloatArray] | None = None
 
-    def mixed(self) -> Overlay:
+    def mix(self) -> Overlay:
         """Return the assignment, by whether bodies that were taken apart are bodies."""
         assert self.whole is not None
         found, (before, p_apart) = self.options.concluded(self.chosen), self.whole
@@ -208,7 +207,7 @@ def _search(options: _Options) -> _Found:
     parted, again, by = options, chosen, score
     for _ in range(2):  # at other drifts, and at the one that is found when these are apart
         cliques = np.flatnonzero(apart > 0.0)
-        parted, start = options.parted(cliques, chosen)
+        parted, start = options.take_apart(cliques, chosen)
         again, by, _ = _joint(parted, start)
         options.suppose(parted.drift_m)
         apart = options.log_odds_apart(options.climb(chosen))
@@ -348,24 +347,21 @@ class _Options:
         self._gap_m = {site: float(gap[rows].max()) for site, rows in self._rows.items()}
         for site, rows in self._rows.items():
             self.sites[int(sighted.clique[known.landmark[rows[0]]])].append(site)
+        self._of_size = [
+            [site for site in self._rows if len(self._rows[site]) == size]
+            for size in sorted({len(rows) for rows in self._rows.values()})
+        ]
         self.suppose(settings.drifts_m[0])
 
     def suppose(self, drift_m: float) -> None:
         """Take unmoved landmarks to be off by a standard deviation from session to session."""
         self.drift_m = drift_m
         self._elsewhere: dict[int, float] = {}
-        for sites in self._by_size(self._rows):
+        for sites in self._of_size:
             rows = np.array([self._rows[site] for site in sites])
             self._elsewhere |= zip(sites, self._log_elsewhere(rows).tolist(), strict=True)
 
-    def _by_size(self, sites: Iterable[int]) -> list[list[int]]:
-        """Return sites, those of as many places together."""
-        some: dict[int, list[int]] = {}
-        for site in sites:
-            some.setdefault(len(self._rows[site]), []).append(site)
-        return list(some.values())
-
-    def parted(self, cliques: IntArray, chosen: IntArray) -> tuple[_Options, IntArray]:
+    def take_apart(self, cliques: IntArray, chosen: IntArray) -> tuple[_Options, IntArray]:
         """Return the options with every member of some cliques by itself, and the assignment (C,) as one of these.
 
         The first member of each keeps clique and sites; the others get new ones, as probable.
@@ -399,17 +395,24 @@ class _Options:
     def log_odds_apart(self, chosen: IntArray) -> FloatArray:
         """Return (C,) log odds that the landmarks of each clique are on bodies of their own, given the others."""
         apart = np.full(len(self.sites), -np.inf)
-        scores, field = self._scores(chosen), self._field(chosen)
-        blocks = self._blocks(chosen)
-        for clique, sites in enumerate(self.sites):
-            for of in (self._rows[site] for site in sites if self._stands(site) and len(self._rows[site]) > 1):
-                out = np.tile(blocks[clique], (len(of), 1))
-                there = self._log_at(of[:, None], field, out) + self.known.log_turned[of]
-                there = there + self.known.log_p_site[self.known.site[of]]
-                moved = self._log_elsewhere(of[:, None]) + self.known.log_p_elsewhere[clique]
-                total = float(np.logaddexp(there, moved).sum()) + math.log1p(-self._p_one_body)
-                values = np.array(list(scores[clique].values()))
-                apart[clique] = max(apart[clique], total - float(np.logaddexp.reduce(values)))
+        several = [
+            (clique, self._rows[site])
+            for clique, sites in enumerate(self.sites)
+            for site in sites
+            if self._stands(site) and len(self._rows[site]) > 1
+        ]
+        if not several:
+            return apart
+        field, blocks = self._field(chosen), self._blocks(chosen)
+        scores = self._scores(chosen, field)
+        for clique, of in several:
+            out = np.tile(blocks[clique], (len(of), 1))
+            there = self._log_at(of[:, None], field, out) + self.known.log_turned[of]
+            there = there + self.known.log_p_site[self.known.site[of]]
+            moved = self._log_elsewhere(of[:, None]) + self.known.log_p_elsewhere[clique]
+            total = float(np.logaddexp(there, moved).sum()) + math.log1p(-self._p_one_body)
+            values = np.array(list(scores[clique].values()))
+            apart[clique] = max(apart[clique], total - float(np.logaddexp.reduce(values)))
         return apart
 
     def likeliest_sites(self) -> IntArray:
@@ -567,9 +570,9 @@ class _Options:
         """Return whether an option of a clique is a site of the map."""
         return ELSEWHERE < option < self.n_sites
 
-    def _scores(self, chosen: IntArray) -> list[dict[int, float]]:
+    def _scores(self, chosen: IntArray, field: _Field | None = None) -> list[dict[int, float]]:
         """Return the log probability of the options of every clique, given the choices for the others."""
-        field, blocks = self._field(chosen), self._blocks(chosen)
+        field, blocks = self._field(chosen) if field is None else field, self._blocks(chosen)
         asked: dict[tuple[int, int], list[tuple[int, IntArray]]] = {}
         there: dict[int, list[tuple[int, IntArray]]] = {}
         for clique, sites in enumerate(self.sites):
