@@ -119,7 +119,7 @@ def export(
     if p_least is None:
         p_least = 0.0 if speed_mask or route_graph is not None else 0.5
     if up is not None:
-        living = replace(living, up=_stated_up(up, living))
+        living = replace(living, up=_find_stated_up(up, living))
     landmarks = living.landmarks(p_least=p_least)
     told = {"out": None if out is None else str(out), "landmarks": len(landmarks), **write(living, landmarks)}
     learned = {} if lifetimes is None else lifetimes_by_class(living)
@@ -157,13 +157,13 @@ def _writer(
     if ahead_s is not None:
         if ending != ".yaml" or route_graph is not None:
             raise ConfigError("is an image with its YAML", path=out, field="--speed-mask", hint="--out speed.yaml")
-        return partial(_speed_mask, out, cell_m, 1.0 if radius_m is None else radius_m, ahead_s)
+        return partial(_write_speed_mask, out, cell_m, 1.0 if radius_m is None else radius_m, ahead_s)
     if route_graph is not None:
         if ending not in (".geojson", ".json"):
             raise ConfigError("is written as GeoJSON", path=out, field="--route-graph", hint="--out open.geojson")
-        return partial(_route_graph, out, route_graph, 0.5 if radius_m is None else radius_m)
+        return partial(_write_route_graph, out, route_graph, 0.5 if radius_m is None else radius_m)
     if format_name is None and ending == ".yaml":
-        return partial(_grid, out, cell_m, 0.25 if radius_m is None else radius_m)
+        return partial(_write_grid, out, cell_m, 0.25 if radius_m is None else radius_m)
     kind = format_called(format_name, out)
 
     def write(_: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
@@ -173,7 +173,7 @@ def _writer(
     return write
 
 
-def _stated_up(text: str, living: LivingMap) -> Up:
+def _find_stated_up(text: str, living: LivingMap) -> Up:
     """Return the direction of up that a user states for a map in space.
 
     Raises:
@@ -196,7 +196,7 @@ def _stated_up(text: str, living: LivingMap) -> Up:
     return Up(direction / length, STATED_RAD, "stated")
 
 
-def _grid(out: Path, cell_m: float, radius_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+def _write_grid(out: Path, cell_m: float, radius_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
     """Write the mask of a keepout filter."""
     from evermap.io.nav2 import write_grid
 
@@ -204,7 +204,7 @@ def _grid(out: Path, cell_m: float, radius_m: float, _: LivingMap, landmarks: La
     return {}
 
 
-def _speed_mask(
+def _write_speed_mask(
     out: Path, cell_m: float, radius_m: float, ahead_s: float, living: LivingMap, landmarks: Landmarks
 ) -> dict[str, Any]:
     """Write where to drive slowly, since the map may be wrong by then."""
@@ -222,7 +222,9 @@ def _speed_mask(
     }
 
 
-def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+def _write_route_graph(
+    out: Path, graph: Path, clearance_m: float, _: LivingMap, landmarks: Landmarks
+) -> dict[str, Any]:
     """Write a route graph; return its closed and its uncertain edges."""
     from evermap.io.nav2 import write_route_graph
 

@@ -131,7 +131,7 @@ def floats_of(cells: Any) -> FloatArray:
     return np.where(known, values, np.nan)
 
 
-def coded(words: Any) -> tuple[IntArray, list[str]]:
+def encode_words(words: Any) -> tuple[IntArray, list[str]]:
     """Return the index (R,) of each cell of a pyarrow array among the distinct ones, -1 if null, and these."""
     found = words.dictionary_encode()
     codes, known = numbers_of(found.indices, np.int32)
@@ -142,7 +142,7 @@ def mapped(cells: Any, pattern: str, change: Callable[[str], str]) -> Any:
     """Return a pyarrow array of text with a change of each different one, if any matches the pattern."""
     if not pc.any(pc.match_substring_regex(cells, pattern)).as_py():
         return cells
-    code, words = coded(cells)
+    code, words = encode_words(cells)
     return arrow_cells([*map(change, words), ""], np.arange(len(words) + 1) < len(words)).take(arrow_cells(code))
 
 

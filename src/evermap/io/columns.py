@@ -17,8 +17,8 @@ from evermap.errors import InputError
 from evermap.io.arrow import (
     arrow_cells,
     arrow_csv,
-    coded,
     dates_as_text,
+    encode_words,
     floats_of,
     mapped,
     numbers_of_text,
@@ -87,7 +87,7 @@ class Columns(NamedColumns):
                 raise self.error(f"{values[wrong[0]]:g} is neither 1 nor 0", row=int(wrong[0]), field=name, hint=hint)
             return values
         words = pc.utf8_lower(pc.utf8_trim_whitespace(cells))
-        row_word, known = coded(words)
+        row_word, known = encode_words(words)
         unknown = [k for k, word in enumerate(known) if word not in _FLAGS]
         if unknown:
             row = int(np.flatnonzero(np.isin(row_word, unknown))[0])
@@ -114,7 +114,7 @@ class Columns(NamedColumns):
             cells = arrow_cells(values, ~np.isnan(values)).cast(pa.int64())
         elif not _is_text(cells.type) and not pa.types.is_integer(cells.type) and not pa.types.is_null(cells.type):
             raise self.error(f"contains {cells.type}, not names", row=None, field=name, hint="text or whole numbers")
-        row_name, names = coded(pc.utf8_trim_whitespace(cells.cast(pa.string())))
+        row_name, names = encode_words(pc.utf8_trim_whitespace(cells.cast(pa.string())))
         for code, text in enumerate(names):
             if not text.isprintable():
                 row = int(np.argmax(row_name == code))

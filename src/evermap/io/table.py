@@ -19,8 +19,8 @@ from evermap.interrupts import raises
 from evermap.io.arrow import (
     arrow_cells,
     arrow_csv,
-    coded,
     dates_as_text,
+    encode_words,
     mapped,
     numbers_of,
     numbers_of_text,
@@ -234,7 +234,7 @@ class Table(NamedColumns):
         cells = self.columns[name]
         if isinstance(cells, np.ndarray):
             return distinct(["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()])
-        row_word, words = distinct(cells) if isinstance(cells, Sequence) else coded(cells)
+        row_word, words = distinct(cells) if isinstance(cells, Sequence) else encode_words(cells)
         for code, word in enumerate(words):
             if not word.isprintable():
                 row = int(np.argmax(row_word == code))

@@ -66,7 +66,7 @@ def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool
     with open_store(where) as store:
         assert isinstance(store, SqlStore)
         while True:
-            found = _reentered(store, work, config)
+            found = _reenter(store, work, config)
             if not adopt or found.revision == found.parent:
                 return found
             try:
@@ -78,7 +78,7 @@ def reenter(where: str, work: Path, config: Config | None = None, *, adopt: bool
                 continue
 
 
-def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
+def _reenter(store: SqlStore, work: Path, config: Config | None) -> Reentered:
     from evermap.maps.store.sql import SqlStore
     from evermap.maps.store.sqlite import snapshot
 
@@ -98,20 +98,20 @@ def _reentered(store: SqlStore, work: Path, config: Config | None) -> Reentered:
     with open_store(part) as fresh:
         assert isinstance(fresh, SqlStore)
         fresh.revert(base, Provenance(note=f"all sessions of revision {head} again"))
-        kept = _taken_over(earlier, fresh, base, steps, config)
+        kept = _take_over(earlier, fresh, base, steps, config)
         living = fresh.load()
         if not kept:
             newest = store.load(head)
             living = with_words_of(living, newest, newest.clock)
         for step in steps[kept:]:
-            living = _entered_again(store, fresh, step, living, config)
+            living = _enter_again(store, fresh, step, living, config)
         revision = fresh.head()
     part.replace(work)
     before.unlink(missing_ok=True)
     return Reentered(len(sessions), sum(s.recording is not None for s in steps[:kept]), head, revision, adopted=False)
 
 
-def _entered_again(store: MapStore, fresh: MapStore, step: Step, living: LivingMap, config: Config | None) -> LivingMap:
+def _enter_again(store: MapStore, fresh: MapStore, step: Step, living: LivingMap, config: Config | None) -> LivingMap:
     """Commit a session or an edit to the copy of a map; returns the map after it."""
     said = step.revision.provenance
     if step.recording is None:
@@ -149,7 +149,7 @@ def _said(living: LivingMap) -> dict[str, Life]:
     return {named[kind]: prior for kind, prior in zip(living.lives.prior_class_id, living.lives.prior, strict=True)}
 
 
-def _taken_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[Step], config: Config | None) -> int:
+def _take_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence[Step], config: Config | None) -> int:
     """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
     from evermap.maps.store.sql import SqlStore
 
