@@ -196,7 +196,7 @@ def _toml_value(text: str) -> Any:
 
 
 def _rule_error(names: Iterable[str], path: Path | None) -> ConfigError:
-    hint = "rules of the method come with evermap; --show-config lists the keys"
+    hint = "evermap slam --show-config lists the keys; the rules of the method come with evermap"
     return ConfigError("is no key that can be set", path=path, field=".".join(names), hint=hint)
 
 
