@@ -12,7 +12,7 @@ from evermap.existence.sites import SiteLooks
 from evermap.maps.living import LivingMap, clique_rows
 from evermap.maps.sessions.believe import believed
 from evermap.maps.sessions.extend import Extended
-from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, looked_at
+from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, count_sides, looked_at
 from evermap.sensing.sightlines import SightLines
 from evermap.types import FloatArray, Sensor
 
@@ -257,3 +257,25 @@ def test_sight_that_is_not_learned_takes_the_field_of_view_for_the_truth() -> No
     assert looks.counts.all()
     assert len(looks.rows) == 10
     np.testing.assert_array_equal(looks.lines.p_free, 1.0)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3, 1.9, 4.0])
+def test_sides_grow_with_the_angle_that_looks_span_in_any_frame(turn_rad: float) -> None:
+    """One from one place, one more for each sector that is spanned, three from all around; a clique without looks has
+    one."""
+    spans = np.deg2rad([0.0, 30.0, 90.0, 300.0])
+    angle = np.concatenate([turn_rad + 0.5 * span * np.linspace(-1.0, 1.0, 601) for span in spans])
+    clique = np.repeat(np.arange(4), 601)
+    away = 7.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    sides = count_sides(clique, away, 5, LivingConfig().looks)
+    assert sides == pytest.approx([1.0, 1.5, 2.5, 3.0, 1.0], abs=0.1)
+    assert sides[0] == 1.0
+
+
+def test_a_side_needs_several_looks() -> None:
+    angle = np.deg2rad([0.0, 0.0, 90.0, 90.0, 90.0])
+    away = np.column_stack([np.cos(angle), np.sin(angle)])
+    for clique, wanted in ((np.zeros(5, dtype=np.int64), 1.0), (np.array([0, 0, 0, 1, 1]), 1.0)):
+        assert count_sides(clique, away, 2, LivingConfig().looks)[0] == pytest.approx(wanted)
+    twice = np.tile(away, (2, 1))
+    assert count_sides(np.zeros(10, dtype=np.int64), twice, 1, LivingConfig().looks)[0] == pytest.approx(2.0)

@@ -45,6 +45,8 @@ USUAL_RANGE = 0.9
 """Share of the detections within whose range a miss says something: data sheets promise more."""
 EXPECTED = 1.5
 """Detections that one position must lead to expect, or its misses are chance."""
+_STARTS = 12
+"""Directions of a sector in which sectors may begin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,22 +261,31 @@ def _hidden(
     of_clique, of_kind = _p_hidden(living.sightlines, sight, looked, hits > 0, p_gone, share, near)
     missed = np.flatnonzero(counts & ~rows.hit)
     eye, place_m = ends(missed)
-    of_clique = of_clique ** _sides(rows.clique[missed], eye - place_m, n, settings)
+    of_clique = of_clique ** count_sides(rows.clique[missed], eye - place_m, n, settings)
     np.fill_diagonal(near, False)
     together = np.exp(near @ np.log(p_gone))
     of_clique = np.where(alone, of_clique / (of_clique + (1.0 - of_clique) * together), of_clique)
     return counts, sight, of_clique, share, of_kind
 
 
-def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
+def count_sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> FloatArray:
     """(C,) number of sides from which each of `n` cliques was looked at, at least one, by the cliques (N,) of the looks
     that count and missed, and (N, 2) from the places to the sensor.
+
+    A side is a sector with enough looks. Their number is the mean over the directions in which sectors may begin,
+    counted from the mean direction of the looks: it grows steadily with the angle that looks span, and a map that is
+    turned has the same.
     """
-    every = settings.sides
-    side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (every / (2.0 * np.pi))).astype(np.int64)
-    count = np.bincount(clique * every + side % every, minlength=n * every).reshape(n, every)
-    sides: IntArray = np.sum(count >= settings.witnesses, axis=1)
-    return np.asarray(np.clip(sides, 1, settings.most_sides))
+    every = settings.sides * _STARTS
+    angle = np.arctan2(away[:, 1], away[:, 0])
+    east, north = (np.bincount(clique, some, minlength=n) for some in (np.cos(angle), np.sin(angle)))
+    turned = np.mod((angle - np.arctan2(north, east)[clique]) * (every / (2.0 * np.pi)) + 0.5, every)
+    part = np.floor(turned).astype(np.int64) % every
+    looks = np.bincount(clique * every + part, minlength=n * every).reshape(n, every)
+    sums = np.cumsum(np.hstack([looks, looks[:, : _STARTS - 1]]), axis=1)
+    within = sums[:, _STARTS - 1 :] - np.hstack([np.zeros((n, 1), dtype=np.int64), sums[:, : every - 1]])
+    enough = within >= settings.witnesses
+    return np.asarray(np.clip(enough.sum(axis=1) / _STARTS, 1.0, settings.most_sides))
 
 
 def _p_hidden(
