@@ -54,9 +54,10 @@ def run_slam(
     from evermap.slam.space.up import with_known_up
 
     config = config or Config()
+    recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     read, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
     recording, remarks, found = check.screened(read, config, prior_map)
-    remarks = (*told, *remarks)
+    remarks, found = (*(one.message for one in riders), *told, *remarks), (*riders, *found)
     if config.slam.unknown_ids and prior_map is not None:
         recording, evidence = nameless.identify_in(recording, prior_map, config)
     else:
@@ -186,6 +187,7 @@ def run_session(
     from evermap.slam import check
 
     config = config or Config()
+    recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     recording = session.with_overlap(session.in_its_space(recording, living, config), living)
     living, whole = session.opened(living, recording), recording
     located: Localised[PlanarVisit] | Localised[SpatialVisit]
@@ -200,6 +202,7 @@ def run_session(
         alone = solve_alone(recording, living, config, progress=progress)
         living, found = session.with_names_of(living, alone.recording), alone.findings
         located = planar.localised(alone, living, config)
+    found = (*riders, *found)
     entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
     return _add_verdict(session.begun_with(entered, whole), living, config, found)
 
@@ -271,7 +274,10 @@ def run_localization(
         raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
+    recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     recording = check.valid(session.in_its_space(recording, living, config), config.sensor)  # type: ignore[type-var]
+    recording, others = check.leave_out_riders(recording, config.slam)
+    riders = (*riders, *others)
     if is_in_space(recording):
         recording, living = session.admitted(recording, living)
         named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
@@ -281,10 +287,10 @@ def run_localization(
         places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
         joint = living.covariance_m2
         result = localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
-        found = check.odd(recording, config.slam)
+        found = (*riders, *check.odd(recording, config.slam))
         result = with_verdict(result, recording, config.slam, living.landmarks(p_least=0.0), findings=found)
         return replace(result, warnings=(*(finding.message for finding in found), *result.warnings))
-    found = check.odd(recording, config.slam)
+    found = (*riders, *check.odd(recording, config.slam))
     recording, living = session.admitted(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))

@@ -15,7 +15,7 @@ from math import degrees, nan
 import numpy as np
 
 from evermap.explain.symptoms import USED, find_motions, find_turns_between
-from evermap.slam.check import CLOCKWISE, CORNERS, SILENCE, is_clockwise
+from evermap.slam.check import CLOCKWISE, CORNERS, RIDER, SILENCE, is_clockwise
 from evermap.slam.gaps import find_gaps, is_outside
 from evermap.slam.mistakes import Finding
 from evermap.types import (
@@ -55,13 +55,14 @@ def find_faults(
         prior_map: that was given, or what a living map expected; it tells in which order corners are.
     """
     order = _order_of_corners(result, recording, prior_map)
+    riders = tuple(_rider(finding) for finding in findings if finding.code == RIDER)
     silent = [finding for finding in findings if finding.code == SILENCE]
     if recording.odometry is None or len(result.trajectory) < 3:
-        return order, ()
+        return order, riders
     gaps_s = find_gaps(recording.odometry)
     start_s = float(recording.odometry.stamp_s[0])
     jumps = find_jumps(result, gaps_s)
-    told = [_jump(*jump, start_s, len(jumps)) for jump in jumps[:1]]
+    told = [*riders, *(_jump(*jump, start_s, len(jumps)) for jump in jumps[:1])]
     if not jumps and (unseen := find_unseen_jumps(result, gaps_s)):
         order = (*order, _jump(*unseen[0], start_s, len(unseen), "while nothing was seen, so that nobody knows when"))
     if not silent or not len(gaps_s):
@@ -86,6 +87,10 @@ def _order_of_corners(result: SlamResult, recording: AnyRecording, prior_map: La
         return ()
     how = CORNERS[CLOCKWISE]
     return (Cause("corner-order", "corners", how.message, probability=1.0, fix=how.fix),)
+
+
+def _rider(finding: Finding) -> Cause:
+    return Cause(RIDER, "detections", finding.message, probability=1.0, fix="detections.csv: none of what rides along")
 
 
 def with_mended(result: SlamResult, mended: tuple[Cause, ...]) -> SlamResult:

@@ -26,9 +26,11 @@ from evermap.slam.mistakes import (
     USUAL,
     Finding,
     find_motion,
+    find_riders,
     find_silences,
     off,
     pairs_of,
+    without_riders,
     without_silences,
 )
 from evermap.slam.orientations import find_convention
@@ -46,15 +48,15 @@ from evermap.types import (
     is_in_space,
     rows_of,
 )
-from evermap.valid import WITHOUT_IDS, check_landmarks, strangers, validate
+from evermap.valid import WITHOUT_IDS, check_landmarks, check_type, strangers, validate
 
 DEFAULTS = SlamConfig()
 OUTSIDE = 0.05
 """Share of the image size by which undistorted corners of tags may lie outside of the image."""
 FEWEST_TAGS, NEARLY_ALL = 10, 0.9
 """Tags of a camera that show the order of its corners, and share of them that must be listed clockwise."""
-SILENCE = "odometry-silence"
-"""Code of the finding, and of the cause, that the odometry is silent."""
+SILENCE, RIDER = "odometry-silence", "rides-along"
+"""Codes of the findings, and of the causes, that the odometry is silent, and that an identity rides with the robot."""
 FAR_LESS = 0.5
 """Difference of pairs of sightings, over that of corners as they are read, at which they were written otherwise."""
 
@@ -495,6 +497,33 @@ def _with_sensors(recording: AnyRecordingT, sensor: SensorConfig) -> AnyRecordin
     return replace(recording, sensor=sensor.applied_to(recording.sensor))
 
 
+def leave_out_riders_in_space(recording: Any, settings: SlamConfig) -> tuple[Any, tuple[Finding, ...]]:
+    """Return the same as `leave_out_riders` of a recording in space, of which it is to be decided whether it is on a
+    floor; one in the plane as it is.
+    """
+    check_type(recording)
+    return leave_out_riders(recording, settings) if is_in_space(recording) else (recording, ())
+
+
+def leave_out_riders(recording: Any, settings: SlamConfig) -> tuple[Any, tuple[Finding, ...]]:
+    """Return a recording without what moves with the robot, which is no landmark, and a finding that says so.
+
+    It comes before all else that is asked of a recording: what rides along is in every frame, and contradicts it all.
+    """
+    if settings.unknown_ids is True:
+        return recording, ()
+    riders = find_riders(recording, settings.check)
+    if not len(riders):
+        return recording, ()
+    names = ", ".join(str(recording.landmark_names.get(one, one)) for one in riders.tolist())
+    where = "is where it was in the sensor's view" if len(riders) == 1 else "are where they were in the sensor's view"
+    message = (
+        f"landmark {names} {where} while the robot moves: on the robot itself, or on what it tows or follows; its "
+        "detections are not used"
+    )
+    return without_riders(recording, riders), (Finding(RIDER, message),)
+
+
 @overload
 def screened(
     recording: Recording, config: Config, prior_map: Landmarks | None = ..., *, repair: bool = ...
@@ -524,7 +553,8 @@ def screened(
         recording = clean(_with_sensors(recording, config.sensor), settings.cleaning)
     else:
         recording = valid(recording, config.sensor, prior_map)
-    found = odd(recording, settings)
+    recording, riders = leave_out_riders(recording, settings)
+    found = (*riders, *odd(recording, settings))
     remarks = tuple(finding.message for finding in found)
     if any(finding.code == SILENCE for finding in found):
         recording = without_silences(recording, find_silences(recording, settings.check))
@@ -565,9 +595,11 @@ def check_recording(recording: AnyRecording, config: Config | None = None) -> Ch
 
     config = config or Config()
     settings = config.slam
+    recording, riders = leave_out_riders_in_space(recording, settings)
     recording = in_its_space(recording, settings)
     recording = valid(recording, config.sensor)  # type: ignore[type-var]
-    found = findings(recording, settings)
+    recording, others = leave_out_riders(recording, settings)
+    found = (*findings(recording, settings), *riders, *others)
     anonymous = (recording.detections.landmark_id == UNKNOWN).all()
     if anonymous and not (settings.unknown_ids or has_traffic(recording)):
         found = (_refusal("no-identities", f"no detection has a landmark_id: {WITHOUT_IDS}"), *found)

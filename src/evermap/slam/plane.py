@@ -22,7 +22,7 @@ from evermap.errors import ConfigError
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import are_of_several_clocks
-from evermap.slam.mistakes import sighting_pairs, unusable
+from evermap.slam.mistakes import find_riders, sighting_pairs, unusable, without_riders
 from evermap.slam.orientations import find_convention, without_unmeasured
 from evermap.slam.space.intake import positions_of, without_range
 from evermap.types import (
@@ -61,7 +61,8 @@ FIELD_MARGIN_RAD = 0.05
 def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | None = None) -> AnyRecording:
     """Return a recording as it is estimated: in the plane where it is one of a robot on a floor; warnings say so.
 
-    Orientations that were not measured are left out (`orientations`). What was estimated in the plane has no heights.
+    What moves with the robot is left out (`mistakes.find_riders`), as are orientations that were not measured
+    (`orientations`). What was estimated in the plane has no heights.
 
     Args:
         recording: as read; one in the plane is returned as it is.
@@ -78,7 +79,9 @@ def in_its_space(recording: AnyRecording, settings: SlamConfig, *, dim: int | No
             problem = f"{recording.name}: a recording in the plane cannot be estimated in space"
             raise ConfigError(problem, field="slam.plane", hint="leave it out")
         return recording
-    recording = without_unmeasured(recording, settings.check)
+    riders = find_riders(recording, settings.check) if settings.unknown_ids is not True else np.zeros(0, dtype=int)
+    stands: SpatialRecording = without_riders(recording, riders)
+    recording = without_unmeasured(stands, settings.check)
     if settings.plane is False or (settings.plane is None and dim == 3):
         return recording
     obstacle = _obstacle(recording)

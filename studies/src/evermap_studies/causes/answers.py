@@ -59,7 +59,7 @@ ANSWERS = {
     "anything": Answer(REFUSED | OUTDATED, is_optional=True),
     "change": Answer(SOUND | OUTDATED, is_change=True),
     "wrong identity": _answer(
-        MENDED, "identity wrong-identity duplicate-identity duplicate double-identity", "identit"
+        MENDED, "identity wrong-identity duplicate-identity duplicate double-identity rides-along", "identit"
     ),
     "misread": replace(
         _answer(MENDED | LOST, "misread misread-identities identity wrong-identity outliers", "identit"),

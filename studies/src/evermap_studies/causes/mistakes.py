@@ -603,6 +603,8 @@ def on_robot(identity: int = 400) -> Mistake:
         frames = np.unique(drive.frame)
         value = np.repeat(drive.value[:1], len(frames), axis=0)
         value = value + rng.normal(0.0, 0.2 if drive.reading is Reading.CORNERS else 0.003, value.shape)
+        if drive.reading is Reading.POSES:
+            value[:, 3:] /= np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
         return replace(
             drive,
             frame=np.concatenate([drive.frame, frames]),
