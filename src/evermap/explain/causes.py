@@ -25,6 +25,7 @@ from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.orientations import find_convention
+from evermap.slam.space.intake import without_range
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -152,6 +153,7 @@ def list_suspects(inputs: Inputs, *, calibrations: bool = False) -> tuple[Suspec
     recording, found = inputs.recording, list[Suspect]()
     if is_in_space(recording):
         has_metre = bool(recording.odometry is not None or inputs.prior_map is not None or recording.measurements)
+        has_metre = has_metre and not without_range(recording).all()
         found += _in_space(recording, calibrations=calibrations, has_metre=has_metre)
     else:
         found += _in_plane(recording, calibrations=calibrations)
@@ -390,7 +392,8 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
 def _in_space(recording: SpatialRecording, *, calibrations: bool, has_metre: bool) -> Iterable[Suspect]:
     """Yield what may be wrong with a recording in space; no scale of all that was seen where nothing else has a metre.
 
-    A smaller world fits as well then, and better with what is supposed of how fast a camera is carried.
+    A smaller world fits as well then, and better with what is supposed of how fast a camera is carried. Nor of
+    directions: what is as far as they meet has no scale of its own.
     """
     seen, sensors = recording.detections, recording.sensors
     sizes = np.unique(np.round(seen.tag_size_m[np.isfinite(seen.tag_size_m)], 6))
@@ -493,9 +496,9 @@ def _all_tags(size: str) -> Suspect:
 def has_scale(recording: SpatialRecording) -> BoolArray:
     """Return (S,) sensors whose detections may have another scale; that of a camera that reads corners is its lens."""
     seen, cameras = recording.detections, np.array([one.intrinsics is not None for one in recording.sensors])
-    measured = ~(cameras[seen.sensor] & np.isfinite(seen.corner_px[:, 0, 0]))
-    found = np.bincount(seen.sensor[measured], minlength=len(cameras)) > 0
-    return np.asarray(found & ~np.isin(np.arange(len(cameras)), seen.sensor[~measured]))
+    corners = cameras[seen.sensor] & np.isfinite(seen.corner_px[:, 0, 0])
+    found = np.bincount(seen.sensor[~(corners | without_range(recording))], minlength=len(cameras)) > 0
+    return np.asarray(found & ~np.isin(np.arange(len(cameras)), seen.sensor[corners]))
 
 
 def _scale_of_sensor(row: int, name: str) -> Suspect:
