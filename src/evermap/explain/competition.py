@@ -36,7 +36,7 @@ from evermap.explain.trial import (
     solve_trial,
     weigh_solution,
 )
-from evermap.explain.triggers import CHANGES, find_symptoms
+from evermap.explain.triggers import CHANGES, SINGLE, find_symptoms
 from evermap.types import SlamResult, is_in_space
 
 REFINED = 2
@@ -82,8 +82,8 @@ def explain(
             sound = Trial(inputs, solution, (), math.nan, 1.0)
             return Explained(sound, find_put_right(solution.result, inputs, config))
         few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
-        if symptoms == (CHANGES,) and few and not (is_suspected or find_score(solution, inputs) > 0.0):
-            screens = screens[:1]  # a landmark or two moved, and no calibration earns anything
+        if symptoms in ((CHANGES,), (SINGLE,)) and few and not (is_suspected or find_score(solution, inputs) > 0.0):
+            screens = screens[:1]  # of a landmark or two, and no calibration earns anything
     base = None if solution is None else weigh_solution(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = Budget(rules.most_solutions)
