@@ -21,7 +21,7 @@ from evermap.geometry import se2
 from evermap.io import write_native
 from evermap.pipeline import run_localization
 from evermap.slam.mistakes import find_silences
-from evermap.slam.ranges import has_range_changed, with_bearings
+from evermap.slam.ranges import has_range_changed, with_bearings, with_bearings_anew
 from evermap.types import (
     UNKNOWN,
     ChangeKind,
@@ -274,6 +274,49 @@ def test_what_ranges_cannot_do_is_told() -> None:
     living = run_session(recording).living
     with pytest.raises(DataError, match=r"field 'bearing_rad'.*not causal \(try: enter the session"):
         run_localization(drive(1, day=1), living)
+
+
+def turning_too_much(recording: Recording, by_radps: float) -> Recording:
+    driven = recording.odometry
+    return replace(recording, odometry=replace(driven, angular_radps=driven.angular_radps + by_radps))
+
+
+def test_first_bearings_are_those_of_the_odometry_that_is_used() -> None:
+    """Those by a gyroscope whose zero is off would all be turned, as a sensor in its mount."""
+    settings = Config().slam
+    right = drive(1)
+    found, _ = with_bearings(right, settings)
+    off, _ = with_bearings(turning_too_much(right, 0.02), settings)
+    assert np.abs(off.detections.bearing_rad - found.detections.bearing_rad).max() > 0.5
+    anew = with_bearings_anew(replace(off, odometry=right.odometry), settings)
+    for name in ("bearing_rad", "sigma_bearing_rad", "range_m", "landmark_id"):
+        assert np.array_equal(getattr(anew.detections, name), getattr(found.detections, name))
+
+
+def test_bearings_that_were_measured_stay() -> None:
+    settings = Config().slam
+    right = drive(1)
+    seen = right.detections
+    own = seen.landmark_id == 2
+    mixed = replace(seen, bearing_rad=np.where(own, 0.1, np.nan), sigma_bearing_rad=np.where(own, 0.02, np.nan))
+    found, _ = with_bearings(replace(right, detections=mixed), settings)
+    anew = with_bearings_anew(turning_too_much(found, 0.02), settings).detections
+    assert np.array_equal(anew.bearing_rad[own], np.full(int(own.sum()), 0.1))
+    assert not np.array_equal(anew.bearing_rad[~own], found.detections.bearing_rad[~own])
+    measured = replace(
+        right, detections=replace(seen, bearing_rad=np.zeros(len(seen)), sigma_bearing_rad=np.full(len(seen), 0.02))
+    )
+    assert with_bearings_anew(measured, settings) is measured
+    lost = replace(found, detections=replace(found.detections, landmark_id=np.where(own, 2, UNKNOWN)))
+    assert with_bearings_anew(lost, settings) is lost
+
+
+def test_a_gyroscope_whose_zero_is_off_is_put_right_by_ranges_alone() -> None:
+    result = run_slam(turning_too_much(drive(1), 0.02))
+    (cause,) = result.causes
+    assert (cause.code, cause.value) == ("turn-bias", pytest.approx(0.02, abs=0.002))
+    askew = next(one for one in result.parameters if one.name == "odometry_askew_rad")
+    assert abs(askew.value) < 0.03
 
 
 STOP_S = (60.0, 68.0)

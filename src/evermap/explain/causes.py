@@ -314,30 +314,26 @@ def _stretch_speeds(inputs: Inputs, state: float) -> Inputs:
 
 
 def _stretch_turns(inputs: Inputs, state: float) -> Inputs:
-    return _turn_by(inputs, math.exp(state))
+    return _with_turns(inputs, lambda turn, _: turn * math.exp(state))
 
 
-def _turn_by(inputs: Inputs, factor: float) -> Inputs:
-    """Return the same with all turns of the odometry times a factor."""
+def turn_less(inputs: Inputs, state: float) -> Inputs:
+    """Return the same with turns of the odometry less by a rate [rad/s] all the time, about z of the robot."""
+    return _with_turns(inputs, lambda turn, lasted_s: turn - state * lasted_s * np.eye(turn.shape[1])[-1])
+
+
+def _with_turns(inputs: Inputs, how: Callable[[FloatArray, FloatArray], FloatArray]) -> Inputs:
+    """Return the same with other turns of the odometry; `how` has (N, 1 or 3) turns and (N, 1) how long each lasted."""
     recording = inputs.recording
     if not is_in_space(recording):
         driven = recording.odometry
-        odometry: Any = replace(driven, angular_radps=driven.angular_radps * factor)
-        return replace(inputs, recording=replace(recording, odometry=odometry))
+        rate = how(driven.angular_radps[:, None], np.ones((len(driven), 1)))[:, 0]
+        return replace(inputs, recording=replace(recording, odometry=replace(driven, angular_radps=rate)))
     path = recording.odometry
     assert path is not None
     step = se3.log(se3.between(path.pose_world_robot[:-1], path.pose_world_robot[1:]))
-    step[:, 3:] *= factor
+    step[:, 3:] = how(step[:, 3:], np.diff(path.stamp_s)[:, None])
     return _with_poses(inputs, np.asarray(se3.compose(path.pose_world_robot[:1], accumulate(se3.exp(step)))))
-
-
-def stretch_stamps(inputs: Inputs, state: float) -> Inputs:
-    """Return the same with the frames at the times of a clock that is slower by this share; half of the drive stays."""
-    recording: Any = inputs.recording
-    stamp_s = recording.frames.stamp_s
-    middle_s = 0.5 * (stamp_s[0] + stamp_s[-1])
-    frames = replace(recording.frames, stamp_s=stamp_s - state * (stamp_s - middle_s))
-    return replace(inputs, recording=replace(recording, frames=frames))
 
 
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:

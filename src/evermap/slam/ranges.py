@@ -102,6 +102,20 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
     return replace(recording, detections=seen), tuple(remarks)
 
 
+def with_bearings_anew(recording: Recording, settings: SlamConfig) -> Recording:
+    """Return a recording whose odometry is another now with first bearings by it, where `with_bearings` gave some."""
+    seen = recording.detections
+    blind = seen.sigma_bearing_rad >= ANY_BEARING_RAD
+    name, first, row = np.unique(seen.landmark_id, return_index=True, return_inverse=True)
+    first = first[np.bincount(row, ~blind) <= 1.0]  # the only one of a landmark that counts, as a first place
+    blind[first[name[row[first]] != UNKNOWN]] = True
+    blind &= seen.landmark_id != UNKNOWN
+    if not blind.any():
+        return recording
+    unset = replace(seen, bearing_rad=np.where(blind, np.nan, seen.bearing_rad))
+    return with_bearings(replace(recording, detections=unset), settings)[0]
+
+
 def has_range_changed(recording: Recording, first: IntArray, second: IntArray) -> BoolArray:
     """Return (P,) pairs of detections of a landmark, rows of the recording, whose ranges differ by more than their
     noise, and by more than a sensor moves on a robot that stands.
