@@ -162,6 +162,16 @@ def test_another_size_of_one_tag_moves_it_not(kind: str) -> None:
     assert result.changes == ()
 
 
+@pytest.mark.slow
+def test_one_tag_of_another_size_is_named_without_a_map() -> None:
+    """Few detections are rejected, but those of one tag in a row."""
+    recording = World(seed=3, sizes={4: 1.35}).space()
+    result = run_slam(recording)
+    cause = named(result, "tag-size")
+    assert (cause.subject, cause.value) == ("4", pytest.approx(1.35, abs=0.02))
+    assert error_m(result, recording, in_map=False) < 0.02
+
+
 @pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
 def test_landmarks_that_moved_are_no_cause(kind: str) -> None:
     recording, survey = recorded(World(seed=4, moved={2: (0.5, 0.3), 9: (-0.6, 0.2)}), kind)

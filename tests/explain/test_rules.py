@@ -8,12 +8,15 @@ from typing import Any, cast
 
 import pytest
 
-from evermap.config import SlamConfig
-from evermap.explain import competition
+from evermap import run_slam
+from evermap.config import Config, SlamConfig
+from evermap.explain import competition, triggers
 from evermap.explain.answer import list_causes
-from evermap.explain.causes import Suspect
+from evermap.explain.causes import Inputs, Suspect
 from evermap.explain.screens import FAR
 from evermap.explain.trial import Asked, Taken, Trial, _state_evidence, _with_last
+
+from .worlds import World
 
 
 def suspect(code: str = "tag-size", subject: str = "5", sigma: float = 0.3, p: float = 0.01) -> Suspect:
@@ -138,3 +141,16 @@ def test_the_cause_that_leads_is_solved_for_before_what_shows_without_a_solution
     assert ranked([(math.inf, shows, far)], linear, best=best) == as_before
     assert ranked([(math.inf, suspect("tag-size", "all", sigma=math.nan), 0.0)], linear, best=best) == as_before
     assert ranked(plain, linear, best=None) == as_before
+
+
+@pytest.mark.parametrize(
+    ("state", "symptoms"), [(0.06, ("distance of one",)), (-0.06, ("distance of one",)), (0.04, ())]
+)
+def test_directions_that_meet_elsewhere_than_ranges_say_are_a_symptom(
+    state: float, symptoms: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = World(seed=1, seconds=10.0).plane()
+    result, inputs = run_slam(recording), Inputs.of(recording, None)
+    assert triggers.find_symptoms(result, inputs, Config().slam) == ()
+    monkeypatch.setattr(triggers, "find_single_scales", lambda *_: {3: state, 4: 0.0})
+    assert triggers.find_symptoms(result, inputs, Config().slam) == symptoms

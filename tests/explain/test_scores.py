@@ -343,3 +343,28 @@ def test_runs_are_asked_what_they_held() -> None:
         assert verdict is not None
         assert verdict.kind is kind, verdict.message
         assert ("mounts of all sensors are -0.0" in verdict.message) is (recording is wrong)
+
+
+def only_directions(recording: SpatialRecording, of_sensor: int | None = None) -> SpatialRecording:
+    """The same detections without their ranges, all or those of a sensor."""
+    seen = recording.detections
+    at = seen.position_sensor_m
+    along = at[:, :, None] * at[:, None, :] / (at**2).sum(axis=1)[:, None, None]
+    covariance = 1e-4 * (np.eye(3) - along) + 1e9 * along
+    mine = np.ones(len(at), dtype=bool) if of_sensor is None else seen.sensor == of_sensor
+    covariance = np.where(mine[:, None, None], covariance, 1e-4 * np.eye(3))
+    return replace(recording, detections=replace(seen, covariance_sensor_m2=covariance))
+
+
+def test_directions_have_no_scale() -> None:
+    """What is as far as they meet fits as well in any: nothing but a prior would say which."""
+    recording = World(seed=1, seconds=10.0).space(corners=False)
+    of_lengths = {"range-scale", "tag-size", "sensor-scale"}
+
+    def asked(given: SpatialRecording) -> set[tuple[str, str]]:
+        suspects = list_suspects(Inputs.of(given, None), calibrations=True)
+        return {(one.code, one.subject) for one in suspects if one.code in of_lengths}
+
+    assert asked(only_directions(recording)) == set()
+    assert asked(recording) == {("range-scale", "sensor"), ("sensor-scale", "front"), ("sensor-scale", "back")}
+    assert asked(only_directions(recording, 1)) == {("range-scale", "sensor"), ("sensor-scale", "front")}

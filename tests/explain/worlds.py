@@ -39,6 +39,7 @@ class World:
         seconds: how long.
         drift: of the odometry, metres for the root of a metre and radians for the root of a radian.
         wheels, turns: true over reported speeds, and turns.
+        bias_radps: by which reported turns are too fast.
         late_s: by which stamps of the detections are late.
         longer: true over reported ranges, or over the stated size of all tags.
         sizes: the same of some landmarks.
@@ -51,6 +52,7 @@ class World:
     drift: float = 0.01
     wheels: float = 1.0
     turns: float = 1.0
+    bias_radps: float = 0.0
     late_s: float = 0.0
     longer: float = 1.0
     bent: float = 0.0
@@ -74,7 +76,7 @@ class World:
         left = -step[:, 0] * np.sin(mid) + step[:, 1] * np.cos(mid)
         noise = random.normal(size=(len(turn), 3)) * np.sqrt(np.abs(ahead))[:, None] * self.drift
         moved = np.column_stack([ahead + noise[:, 0], left + 0.3 * noise[:, 1], turn + noise[:, 2]])
-        return stamp_s[:-1], moved / 0.02 / [self.wheels, self.wheels, self.turns]
+        return stamp_s[:-1], moved / 0.02 / [self.wheels, self.wheels, self.turns] + [0.0, 0.0, self.bias_radps]
 
     @property
     def place(self) -> np.ndarray:

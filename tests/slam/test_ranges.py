@@ -20,7 +20,8 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.io import write_native
 from evermap.pipeline import run_localization
-from evermap.slam.ranges import with_bearings
+from evermap.slam.mistakes import find_silences
+from evermap.slam.ranges import has_range_changed, with_bearings, with_bearings_anew
 from evermap.types import (
     UNKNOWN,
     ChangeKind,
@@ -273,3 +274,92 @@ def test_what_ranges_cannot_do_is_told() -> None:
     living = run_session(recording).living
     with pytest.raises(DataError, match=r"field 'bearing_rad'.*not causal \(try: enter the session"):
         run_localization(drive(1, day=1), living)
+
+
+def turning_too_much(recording: Recording, by_radps: float) -> Recording:
+    driven = recording.odometry
+    return replace(recording, odometry=replace(driven, angular_radps=driven.angular_radps + by_radps))
+
+
+def test_first_bearings_are_those_of_the_odometry_that_is_used() -> None:
+    """Those by a gyroscope whose zero is off would all be turned, as a sensor in its mount."""
+    settings = Config().slam
+    right = drive(1)
+    found, _ = with_bearings(right, settings)
+    off, _ = with_bearings(turning_too_much(right, 0.02), settings)
+    assert np.abs(off.detections.bearing_rad - found.detections.bearing_rad).max() > 0.5
+    anew = with_bearings_anew(replace(off, odometry=right.odometry), settings)
+    for name in ("bearing_rad", "sigma_bearing_rad", "range_m", "landmark_id"):
+        assert np.array_equal(getattr(anew.detections, name), getattr(found.detections, name))
+
+
+def test_bearings_that_were_measured_stay() -> None:
+    settings = Config().slam
+    right = drive(1)
+    seen = right.detections
+    own = seen.landmark_id == 2
+    mixed = replace(seen, bearing_rad=np.where(own, 0.1, np.nan), sigma_bearing_rad=np.where(own, 0.02, np.nan))
+    found, _ = with_bearings(replace(right, detections=mixed), settings)
+    anew = with_bearings_anew(turning_too_much(found, 0.02), settings).detections
+    assert np.array_equal(anew.bearing_rad[own], np.full(int(own.sum()), 0.1))
+    assert not np.array_equal(anew.bearing_rad[~own], found.detections.bearing_rad[~own])
+    measured = replace(
+        right, detections=replace(seen, bearing_rad=np.zeros(len(seen)), sigma_bearing_rad=np.full(len(seen), 0.02))
+    )
+    assert with_bearings_anew(measured, settings) is measured
+    lost = replace(found, detections=replace(found.detections, landmark_id=np.where(own, 2, UNKNOWN)))
+    assert with_bearings_anew(lost, settings) is lost
+
+
+def test_a_gyroscope_whose_zero_is_off_is_put_right_by_ranges_alone() -> None:
+    result = run_slam(turning_too_much(drive(1), 0.02))
+    (cause,) = result.causes
+    assert (cause.code, cause.value) == ("turn-bias", pytest.approx(0.02, abs=0.002))
+    askew = next(one for one in result.parameters if one.name == "odometry_askew_rad")
+    assert abs(askew.value) < 0.03
+
+
+STOP_S = (60.0, 68.0)
+
+
+def stopping(recording: Recording, *, seen: bool = False) -> Recording:
+    """The odometry says that the robot stands for a while; if `seen`, ranges say so, too."""
+    driven, frame_s = recording.odometry, recording.frames.stamp_s
+    still = (driven.stamp_s >= STOP_S[0]) & (driven.stamp_s < STOP_S[1])
+    columns = {name: np.where(still, 0.0, getattr(driven, name)) for name in ("forward_mps", "angular_radps")}
+    detections = recording.detections
+    if seen:
+        stamp_s, range_m = frame_s[detections.frame], detections.range_m.copy()
+        noise = SIGMA_M * np.random.default_rng(2).normal(size=len(range_m))
+        for name in np.unique(detections.landmark_id):
+            rows = np.flatnonzero((detections.landmark_id == name) & (stamp_s >= STOP_S[0]) & (stamp_s < STOP_S[1]))
+            range_m[rows] = range_m[rows[:1]] + noise[rows]
+        detections = replace(detections, range_m=range_m)
+    return replace(recording, odometry=replace(driven, **columns), detections=detections)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_ranges_say_that_a_robot_drives_that_says_it_stands(seed: int) -> None:
+    rules = Config().slam.check
+    (found,) = find_silences(stopping(drive(seed)), rules)
+    assert found == pytest.approx(STOP_S, abs=0.11)
+    assert not len(find_silences(stopping(drive(seed), seen=True), rules))
+    assert not len(find_silences(drive(seed), rules))
+
+
+def test_a_range_has_changed_by_more_than_its_noise_and_than_a_robot_sways() -> None:
+    """By noise of 5 cm three standard deviations of a difference are 21 cm; with none, 2 % of the range count."""
+    noise = 0.05 * np.random.default_rng(1).normal(size=4000)
+    first, second = np.array([0, 0]), np.array([4000, 4001])
+    for sigma, least_m in ((1.0, 3.0 * 2.0**0.5 * 0.05), (0.0, 0.02 * 8.0)):
+        range_m = np.append(8.0 + sigma * noise, [0.0, 0.0])
+        range_m[4000:] = range_m[0] + least_m * np.array([0.93, 1.07])
+        one = drive(1)
+        nothing = np.full(len(range_m), np.nan)
+        frame = np.arange(len(range_m))
+        seen = Detections(
+            frame, np.zeros(len(frame), dtype=int), range_m, nothing, np.full(len(frame), UNKNOWN), nothing, nothing,
+            np.full(len(frame), UNKNOWN),
+        )  # fmt: skip
+        recording = replace(one, detections=seen, frames=Frames(0.1 * frame))
+        assert has_range_changed(recording, first, second).tolist() == [False, True]

@@ -25,6 +25,7 @@ from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.orientations import find_convention
+from evermap.slam.space.intake import without_range
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -152,6 +153,7 @@ def list_suspects(inputs: Inputs, *, calibrations: bool = False) -> tuple[Suspec
     recording, found = inputs.recording, list[Suspect]()
     if is_in_space(recording):
         has_metre = bool(recording.odometry is not None or inputs.prior_map is not None or recording.measurements)
+        has_metre = has_metre and not without_range(recording).all()
         found += _in_space(recording, calibrations=calibrations, has_metre=has_metre)
     else:
         found += _in_plane(recording, calibrations=calibrations)
@@ -312,30 +314,26 @@ def _stretch_speeds(inputs: Inputs, state: float) -> Inputs:
 
 
 def _stretch_turns(inputs: Inputs, state: float) -> Inputs:
-    return _turn_by(inputs, math.exp(state))
+    return _with_turns(inputs, lambda turn, _: turn * math.exp(state))
 
 
-def _turn_by(inputs: Inputs, factor: float) -> Inputs:
-    """Return the same with all turns of the odometry times a factor."""
+def turn_less(inputs: Inputs, state: float) -> Inputs:
+    """Return the same with turns of the odometry less by a rate [rad/s] all the time, about z of the robot."""
+    return _with_turns(inputs, lambda turn, lasted_s: turn - state * lasted_s * np.eye(turn.shape[1])[-1])
+
+
+def _with_turns(inputs: Inputs, how: Callable[[FloatArray, FloatArray], FloatArray]) -> Inputs:
+    """Return the same with other turns of the odometry; `how` has (N, 1 or 3) turns and (N, 1) how long each lasted."""
     recording = inputs.recording
     if not is_in_space(recording):
         driven = recording.odometry
-        odometry: Any = replace(driven, angular_radps=driven.angular_radps * factor)
-        return replace(inputs, recording=replace(recording, odometry=odometry))
+        rate = how(driven.angular_radps[:, None], np.ones((len(driven), 1)))[:, 0]
+        return replace(inputs, recording=replace(recording, odometry=replace(driven, angular_radps=rate)))
     path = recording.odometry
     assert path is not None
     step = se3.log(se3.between(path.pose_world_robot[:-1], path.pose_world_robot[1:]))
-    step[:, 3:] *= factor
+    step[:, 3:] = how(step[:, 3:], np.diff(path.stamp_s)[:, None])
     return _with_poses(inputs, np.asarray(se3.compose(path.pose_world_robot[:1], accumulate(se3.exp(step)))))
-
-
-def stretch_stamps(inputs: Inputs, state: float) -> Inputs:
-    """Return the same with the frames at the times of a clock that is slower by this share; half of the drive stays."""
-    recording: Any = inputs.recording
-    stamp_s = recording.frames.stamp_s
-    middle_s = 0.5 * (stamp_s[0] + stamp_s[-1])
-    frames = replace(recording.frames, stamp_s=stamp_s - state * (stamp_s - middle_s))
-    return replace(inputs, recording=replace(recording, frames=frames))
 
 
 def _shift_stamps(inputs: Inputs, state: float) -> Inputs:
@@ -390,7 +388,8 @@ def _undo_in_plane(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Input
 def _in_space(recording: SpatialRecording, *, calibrations: bool, has_metre: bool) -> Iterable[Suspect]:
     """Yield what may be wrong with a recording in space; no scale of all that was seen where nothing else has a metre.
 
-    A smaller world fits as well then, and better with what is supposed of how fast a camera is carried.
+    A smaller world fits as well then, and better with what is supposed of how fast a camera is carried. Nor of
+    directions: what is as far as they meet has no scale of its own.
     """
     seen, sensors = recording.detections, recording.sensors
     sizes = np.unique(np.round(seen.tag_size_m[np.isfinite(seen.tag_size_m)], 6))
@@ -493,9 +492,9 @@ def _all_tags(size: str) -> Suspect:
 def has_scale(recording: SpatialRecording) -> BoolArray:
     """Return (S,) sensors whose detections may have another scale; that of a camera that reads corners is its lens."""
     seen, cameras = recording.detections, np.array([one.intrinsics is not None for one in recording.sensors])
-    measured = ~(cameras[seen.sensor] & np.isfinite(seen.corner_px[:, 0, 0]))
-    found = np.bincount(seen.sensor[measured], minlength=len(cameras)) > 0
-    return np.asarray(found & ~np.isin(np.arange(len(cameras)), seen.sensor[~measured]))
+    corners = cameras[seen.sensor] & np.isfinite(seen.corner_px[:, 0, 0])
+    found = np.bincount(seen.sensor[~(corners | without_range(recording))], minlength=len(cameras)) > 0
+    return np.asarray(found & ~np.isin(np.arange(len(cameras)), seen.sensor[corners]))
 
 
 def _scale_of_sensor(row: int, name: str) -> Suspect:

@@ -17,7 +17,15 @@ from evermap.config import SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import list_causes
 from evermap.explain.causes import Inputs, Suspect, list_suspects
-from evermap.explain.put_right import add_late_sensor, find_late_sensor, find_put_right, solve_at_true_stamps
+from evermap.explain.put_right import (
+    add_late_sensor,
+    add_put_right,
+    find_late_sensor,
+    find_put_right,
+    find_turns_off,
+    solve_at_true_stamps,
+    solve_with_right_turns,
+)
 from evermap.explain.screens import LINEAR, is_near, screen_continuous, screen_plain
 from evermap.explain.trial import (
     FEWER,
@@ -36,7 +44,7 @@ from evermap.explain.trial import (
     solve_trial,
     weigh_solution,
 )
-from evermap.explain.triggers import CHANGES, find_symptoms
+from evermap.explain.triggers import CHANGES, SINGLE, find_symptoms
 from evermap.types import SlamResult, is_in_space
 
 REFINED = 2
@@ -78,12 +86,18 @@ def explain(
     screens: tuple[Callable[..., Asked], ...] = (screen_plain, screen_continuous)  # what costs nothing first
     if solution is not None:
         symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
+        off = () if symptoms else find_turns_off(solution, inputs)
+        right = solve_with_right_turns(inputs, off, solve_under, config) if off else None
+        if right is not None:
+            given, now, off = right
+            since = explain(given, now, solve_under, config, say, is_read_well=is_read_well, is_suspected=is_suspected)
+            return None if since is None else add_put_right(since, *off)
         if not (symptoms or is_suspected):
             sound = Trial(inputs, solution, (), math.nan, 1.0)
             return Explained(sound, find_put_right(solution.result, inputs, config))
         few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
-        if symptoms == (CHANGES,) and few and not (is_suspected or find_score(solution, inputs) > 0.0):
-            screens = screens[:1]  # a landmark or two moved, and no calibration earns anything
+        if symptoms in ((CHANGES,), (SINGLE,)) and few and not (is_suspected or find_score(solution, inputs) > 0.0):
+            screens = screens[:1]  # of a landmark or two, and no calibration earns anything
     base = None if solution is None else weigh_solution(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = Budget(rules.most_solutions)

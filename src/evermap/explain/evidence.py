@@ -326,19 +326,49 @@ class Screen:
         crossed = column.solved.own_right @ self.solved.own_right + self.solved.right @ column.border
         return float(column.told @ (self.residual * self.root) - crossed)
 
-    def variance(self, column: Column, value: float) -> float:
+    def follow(self, column: Column, value: float) -> FloatArray:
+        """Return (R,) by how much weighted residuals change for a unit of a further number, all else at its optimum, in
+        what is linear of a step to `value`.
+        """
+        graph, state = self.optimum.graph, self.optimum.state
+        there, _ = graph.retract(state, TINY * value * column.step())
+        residual = residuals_of(graph, exhausted(graph.linearised(there)))[0]
+        return np.asarray(column.told + (residual - self.residual) * self.root / (TINY * value))
+
+    def variance(
+        self, column: Column, value: float, step: FloatArray | None = None, group: IntArray | None = None
+    ) -> float:
         """Return the variance of the slope along a further number, as residuals are, not as they are said to be.
 
         White's (1980), of rows that are independent: some parts of a motion are less certain than others of which the
         same noise was learned. Residuals are those at the optimum, or that its step to `value` leaves: where that is
         long, what is linear goes too far for few rows, and where it is right the first are too large.
+
+        Args:
+            column: the number.
+            value: of it.
+            step: (R,) by which weighted residuals change with the step of this and of others; None: of this alone.
+            group: (R,) rows of which are independent, as groups, from 0 on; None: of all.
         """
-        graph, state = self.optimum.graph, self.optimum.state
-        there, _ = graph.retract(state, TINY * value * column.step())
-        residual = residuals_of(graph, exhausted(graph.linearised(there)))[0]
-        with_all = column.told + (residual - self.residual) * self.root / (TINY * value)
-        before = self.residual * self.root
-        return min(float(np.sum((with_all * left) ** 2)) for left in (before, before + value * with_all))
+        with_all, before = self.follow(column, value), self.residual * self.root
+        slopes = (with_all * left for left in (before, before + (value * with_all if step is None else step)))
+        return min(float(np.sum((slope if group is None else np.bincount(group, slope)) ** 2)) for slope in slopes)
+
+    def find_stretches(self, pose_row: IntArray, count: int) -> IntArray:
+        """Return (R,) groups for `variance`: the odometry and detections of each of some stretches of the drive.
+
+        Args:
+            pose_row: (M,) pose of each detection.
+            count: of stretches, alike in their number of steps.
+        """
+        structure = self.optimum.graph.structure
+        first, rows = structure.first, structure.system.factors.rows
+        group = count + np.arange(len(rows))
+        steps, seen = (slice(first[block], first[block + 1]) for block in (ODOMETRY, DETECTIONS))
+        poses = first[ODOMETRY + 1] - first[ODOMETRY] + 1
+        group[steps] = count * np.arange(poses - 1) // poses
+        group[seen] = count * pose_row[: seen.stop - seen.start] // poses
+        return np.repeat(group, rows)
 
     def score(self, direction: FloatArray, information: float, off: float = 0.0) -> Score:
         """Return what a number does by which residuals (R,), not weighted, change so.

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 from evermap.config import SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import CLOCK, OWN_STATES, find_ratio
 from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.scores import is_unusual, score_odometry
 from evermap.explain.symptoms import SURELY, find_odometry_delay
 from evermap.explain.trial import Explained, SessionSolution, Solve, Taken, VisitT
 from evermap.explain.triggers import LENGTH_OFF
 from evermap.slam.estimate import Solved
+from evermap.slam.ranges import with_bearings_anew
 from evermap.types import UNKNOWN, Cause, ParameterEstimate, SlamResult, is_in_space
 
 SHAPE = 5
@@ -61,17 +64,61 @@ def solve_at_true_stamps(
     return None if find_late_sensor(now.result, given) is not None else (given, now)
 
 
+def find_turns_off(solution: SessionSolution[VisitT], inputs: Inputs) -> tuple[Taken, ...]:
+    """Return by how much turns of the odometry are off where that is more than is usual of robots, and no state of the
+    solution: the zero of its gyroscope, in space also the scale. Poses are right for all that, as far as detections
+    hold them; noise levels, and states, have taken it in.
+    """
+    found = score_odometry(solution.session, inputs)
+    return tuple(Taken(one.suspect, one.value, one.sigma**-2) for one in found if is_unusual(one))
+
+
+def solve_with_right_turns(
+    inputs: Inputs, off: Sequence[Taken], solve_under: Solve[VisitT], config: SlamConfig
+) -> tuple[Inputs, SessionSolution[VisitT], tuple[Taken, ...]] | None:
+    """Return inputs without what turns are off by, their solution, and by how much they are off by that as well; None
+    where they are unusual all the same.
+    """
+    for one in off:
+        inputs = one.suspect.undo(inputs, one.state)
+    try:
+        if not is_in_space(inputs.recording):
+            inputs = replace(inputs, recording=with_bearings_anew(inputs.recording, config))
+        now = solve_under(inputs)
+    except EvermapError:  # nothing can be estimated then
+        return None
+    left = {one.suspect.code: one for one in score_odometry(now.session, inputs)}
+    if any(is_unusual(one) for one in left.values()):
+        return None
+    known = [(one, left.get(one.suspect.code)) for one in off]
+    return (
+        inputs,
+        now,
+        tuple(
+            one if more is None else Taken(one.suspect, one.state + more.value, more.sigma**-2) for one, more in known
+        ),
+    )
+
+
 def add_late_sensor(explained: Explained[VisitT], late: Taken, result: SlamResult) -> Explained[VisitT]:
     """Return what explains a session at its true stamps, with how late those that were given are: by what was taken off
     them, and by what `result` has left of it.
     """
     left = find_odometry_delay(result)
-    suspect, state = late.suspect, late.state - (0.0 if left is None else left.value)
-    cause = Cause(
-        suspect.code, suspect.subject, suspect.say(state), state, late.information**-0.5, 1.0, suspect.fix(state)
-    )
-    best = replace(explained.best, taken=(late, *explained.best.taken))
-    return replace(explained, best=best, causes=(cause, *explained.causes))
+    return add_put_right(explained, replace(late, state=late.state - (0.0 if left is None else left.value)))
+
+
+def add_put_right(explained: Explained[VisitT], *taken: Taken) -> Explained[VisitT]:
+    """Return what explains a session, with causes that were undone before it was solved."""
+    causes = tuple(
+        Cause(
+            one.suspect.code, one.suspect.subject, one.suspect.say(one.state), one.suspect.shown(one.state),
+            one.information**-0.5, 1.0, one.suspect.fix(one.state),
+        )
+        for one in taken
+    )  # fmt: skip
+    best = replace(explained.best, taken=(*taken, *explained.best.taken))
+    return replace(explained, best=best, causes=(*causes, *explained.causes))
 
 
 def find_put_right(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tuple[Cause, ...]:

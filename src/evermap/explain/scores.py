@@ -14,10 +14,10 @@ poses beside the break hang on it by detections alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from evermap.explain.causes import (
     Inputs,
     Suspect,
     list_suspects,
-    stretch_stamps,
+    turn_less,
 )
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
 from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion
@@ -45,12 +45,14 @@ SIGNIFICANT = 10.0
 """Gain of a score test [nats]: 4.5 standard deviations, of thirty or so that are asked of a run."""
 MOST_SHIFT = 0.5
 """Standard deviations by which a calibration may move the poses and be let be."""
-USUAL = frozenset({"odometry-scale", "turn-scale"})
+USUAL = frozenset({"odometry-scale", "turn-scale", "turn-bias"})
 """Calibrations that are off on every robot: they may be so beside any other."""
 OF_MOTION = USUAL | {"clock", "clock-drift"}
 """What changes residuals by how the robot moved."""
-USUAL_SIGMA = 0.02
-"""Standard deviation of the logarithm of these."""
+USUAL_SHARE = 0.13
+"""Standard deviation of these, where all is well, over that beforehand: 2 % of a scale, .4 deg/s of a gyroscope."""
+STRETCHES = 8
+"""Parts of a drive by which slopes along them are compared."""
 OF_LENGTHS = frozenset({"range-scale", "tag-size", "map-scale"})
 """What changes all lengths. In the plane these are states, at a mean of several priors, which is no optimum."""
 CHANCE = 4.0
@@ -65,12 +67,28 @@ FEWEST_STEPS = 30
 """Steps of which a correlation says something."""
 
 
+def _stretch_stamps(inputs: Inputs, state: float) -> Inputs:
+    """Return the same with the frames at the times of a clock that is slower by this share; half of the drive stays."""
+    recording: Any = inputs.recording
+    stamp_s = recording.frames.stamp_s
+    middle_s = 0.5 * (stamp_s[0] + stamp_s[-1])
+    frames = replace(recording.frames, stamp_s=stamp_s - state * (stamp_s - middle_s))
+    return replace(inputs, recording=replace(recording, frames=frames))
+
+
 DRIFT = Suspect(
-    "clock-drift", "clocks", RARE_P, stretch_stamps,
+    "clock-drift", "clocks", RARE_P, _stretch_stamps,
     lambda s: f"the clock of the detections runs {abs(s):.2%} {'fast' if s > 0 else 'slow'} of that of the odometry",
     lambda s: f"detections.csv, frames.csv: stamp_s x {1.0 - s:.5g}", CLOCK_RATE,
 )  # fmt: skip
 """Two clocks that drift apart; at half of the drive they agree, but for the delay that is estimated."""
+TURN_BIAS = Suspect(
+    "turn-bias", "odometry", USUAL_P, turn_less,
+    lambda s: f"the odometry turns {abs(s):.3g} rad/s too much to the {'left' if s > 0.0 else 'right'} all the time: "
+    "the zero of the gyroscope",
+    lambda s: f"odometry.csv: turns {'-' if s > 0.0 else '+'} {abs(s):.3g} rad/s", 0.05,
+)  # fmt: skip
+"""A gyroscope that reads a rate at rest: cheap ones are off by up to 3 deg/s before they are calibrated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +100,7 @@ class CalibrationScore:
         value, sigma: the step, and its standard deviation.
         gain: log likelihood that it gains [nats], errors that last counted once.
         shift: median of how far poses would move, over the median of their standard deviations; of clocks that drift
-            apart the most.
+            apart the most. Of what is usual of odometry it is not asked: nan.
     """
 
     suspect: Suspect
@@ -90,6 +108,17 @@ class CalibrationScore:
     sigma: float
     gain: float
     shift: float
+
+
+class _Usual(NamedTuple):
+    """What is off on every robot: its cause, by how much residuals (R,) change with it, the same as a further number at
+    the optimum, and the slope of the cost along it.
+    """
+
+    suspect: Suspect
+    direction: FloatArray
+    column: Column
+    pull: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +153,11 @@ class SessionScores:
         return max(self.told, key=lambda one: one.shift, default=None)
 
 
+def is_unusual(score: CalibrationScore) -> bool:
+    """Return whether a step is significant, and more than twice what is usual of odometry."""
+    return score.gain > SIGNIFICANT and abs(score.value) > 2.0 * USUAL_SHARE * score.suspect.sigma
+
+
 def score_session(session: AnySession, inputs: Inputs, trajectory: Trajectory) -> SessionScores:
     """Return what a solved session tells of what it held as stated.
 
@@ -151,8 +185,9 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
     """Yield the step of each calibration, what is usual of odometry marginalised."""
     optimum, dim = screen.optimum, inputs.recording.dim
     at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
-    usual = list[tuple[Column, float, FloatArray]]()
-    for suspect in sorted(_list_calibrations(inputs), key=lambda one: one.code not in USUAL):
+    usual = _list_usual(session, screen, inputs)
+    between, steps = _find_shared(usual, USUAL_SHARE), [one.column.step()[at] for one in usual]
+    for suspect in _list_calibrations(inputs):
         if suspect.code == "clock" and _is_delay_estimated(session, inputs, suspect):
             continue
         if suspect.code in OF_MOTION:
@@ -162,21 +197,16 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         if direction is None:
             continue
         column = screen.column(direction)
-        if suspect.code in USUAL:
-            usual.append((column, screen.pull(column), column.step()[at]))
-            continue
         prior = suspect.sigma**-2
         known, pull = column.information_with(column), screen.pull(column)
         if not known > INFORMED * prior:  # nothing but its prior says where it is
             continue
-        shared = np.array([column.information_with(one) for one, _, _ in usual])
-        between = np.array([[one.information_with(two) for two, _, _ in usual] for one, _, _ in usual])
-        between = between.reshape(len(usual), len(usual)) + USUAL_SIGMA**-2 * np.eye(len(usual))
+        shared = np.array([column.information_with(one.column) for one in usual])
         taken = np.linalg.solve(between, shared)
         known += prior - float(shared @ taken)
-        pull -= float(taken @ [each for _, each, _ in usual])
+        pull -= float(taken @ [one.pull for one in usual])
         value = -pull / known
-        moved = column.step()[at] - sum((by * step for by, (_, _, step) in zip(taken, usual, strict=True)), np.zeros(1))
+        moved = column.step()[at] - sum((by * step for by, step in zip(taken, steps, strict=True)), np.zeros(1))
         moved = np.linalg.norm(value * (moved + _went_by_clock(session, suspect, dim)), axis=1)
         # a drift goes on, and is worst at an end
         shift = float(np.max(moved) if suspect is DRIFT else np.median(moved))
@@ -184,6 +214,66 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         if gain > CHANCE:
             gain /= max(screen.variance(column, value) / column.information_with(column), 1.0)
         yield CalibrationScore(suspect, value, known**-0.5, gain, shift / sigma_m)
+
+
+def score_odometry(session: AnySession, inputs: Inputs) -> tuple[CalibrationScore, ...]:
+    """Return the steps of what is off on every robot and no state of the solution, each beside the others: turns, and
+    the zero of the gyroscope. Errors of a motion last, so slopes are compared between stretches of the drive.
+
+    Args:
+        session: the solution.
+        inputs: of which it is the solution.
+    """
+    try:
+        screen = Screen.of(optimum_of(session))
+        usual = [one for one in _list_usual(session, screen, inputs) if not _is_state(session, one.suspect)]
+    except EvermapError:
+        return ()
+    if not usual:
+        return ()
+    solved = session.outcome.problem if isinstance(session, Solved) else session.solved.optimum.smoother.problem
+    information = _find_shared(usual, 1.0)
+    covariance = np.linalg.inv(information)
+    value = -covariance @ [one.pull for one in usual]
+    directions = np.array([one.direction for one in usual])
+    step, found = None, list[CalibrationScore]()
+    for row, one in enumerate(usual):
+        if not one.column.information_with(one.column) > INFORMED * one.suspect.sigma**-2:
+            continue
+        best, variance = float(value[row]), float(covariance[row, row])
+        gain = 0.5 * best**2 / variance * screen.optimum.worth
+        if gain > CHANCE:
+            step = screen.follow(screen.column(value @ directions), 1.0) if step is None else step
+            stretches = screen.find_stretches(solved.pose_row, STRETCHES)
+            beside = screen.column(covariance[row] @ directions / variance)  # the others at their best beside it
+            gain /= max(screen.variance(beside, best, step, stretches) / beside.information_with(beside), 1.0)
+        found.append(CalibrationScore(one.suspect, best, variance**0.5, gain, math.nan))
+    return tuple(found)
+
+
+def _list_usual(session: AnySession, screen: Screen, inputs: Inputs) -> list[_Usual]:
+    """Return what is usual of odometry, at a solution."""
+    found = list[_Usual]()
+    for suspect in (*list_suspects(inputs, calibrations=True), TURN_BIAS):
+        if suspect.code not in USUAL or inputs.recording.odometry is None:
+            continue
+        direction = change_by_motion(session, screen, inputs, suspect)
+        if direction is not None:
+            column = screen.column(direction)
+            found.append(_Usual(suspect, direction, column, screen.pull(column)))
+    return found
+
+
+def _is_state(session: AnySession, suspect: Suspect) -> bool:
+    """Return whether the solution has a state for it: for scales of odometry in the plane, for its length in space."""
+    return suspect.code == "odometry-scale" or (isinstance(session, Solved) and suspect.code == "turn-scale")
+
+
+def _find_shared(usual: Sequence[_Usual], share: float) -> FloatArray:
+    """Return the information (K, K) that what is usual shares, of priors of a share of their standard deviations."""
+    between = np.array([[one.column.information_with(two.column) for two in usual] for one in usual])
+    prior = np.array([(share * one.suspect.sigma) ** -2.0 for one in usual])
+    return between.reshape(len(usual), len(usual)) + np.diag(prior)
 
 
 def _is_delay_estimated(session: AnySession, inputs: Inputs, suspect: Suspect) -> bool:
@@ -239,7 +329,7 @@ def _list_calibrations(inputs: Inputs) -> Iterable[Suspect]:
     """Yield all that may be off of a sensor as a whole, of the odometry and of the map."""
     recording = inputs.recording
     for suspect in list_suspects(inputs, calibrations=True):
-        if is_in_space(recording) or suspect.code not in OF_LENGTHS:
+        if suspect.code not in USUAL and (is_in_space(recording) or suspect.code not in OF_LENGTHS):
             yield suspect
     if recording.odometry is not None:
         yield DRIFT

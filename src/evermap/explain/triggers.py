@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.config import SlamConfig
 from evermap.explain.causes import MOUNT_M, Inputs, has_scale
-from evermap.explain.seeds import find_mount, find_sensor_scales
+from evermap.explain.seeds import find_mount, find_sensor_scales, find_single_scales
 from evermap.explain.symptoms import compare_odometry
 from evermap.explain.trial import INLIER, OF_NOISE, share_rejected
 from evermap.slam.check import find_misreadings
@@ -22,8 +22,9 @@ ODOMETRY_OFF = 0.3
 LENGTH_OFF, ODOMETRY_NOISY = 0.13, 2.5
 """Logarithm of the length of the trajectory over that of the odometry, and its noise over what is usual, from which the
 same is asked: a run that is sound has less."""
-CHANGES, INNOVATIONS = "changes", "innovations"
-"""Symptoms of a session in which landmarks changed, and of one whose detections scatter wider than they should."""
+CHANGES, INNOVATIONS, SINGLE = "changes", "innovations", "distance of one"
+"""Symptoms of a session in which landmarks changed, of one whose detections scatter wider than they should, and of one
+in which most detections of a landmark were rejected, and their directions meet nearer or farther than they say."""
 SIDEWAYS, SLIPS = "sigma_lateral_per_sqrt_m", 1.5
 """Name of the level of lateral slip, and times its usual value from which it is asked where the sensor sits."""
 OF_LANDMARKS = frozenset({ChangeKind.MOVED, ChangeKind.ROTATED, ChangeKind.SWAPPED})
@@ -76,6 +77,9 @@ def find_symptoms(
         found.append("mount")
     if not found and (np.abs(compare_sensors(inputs)) > LEAST_SCALE).any():
         found.append("sensors")
+    if not found:
+        single = find_single_scales(inputs.recording, result).values()
+        found += [SINGLE] if any(abs(state) > LEAST_SINGLE for state in single) else []
     if not found:
         apart, _, longer = compare_odometry(result, inputs.recording.odometry)
         if apart > ODOMETRY_OFF or abs(math.log(max(longer, 1e-9))) > LENGTH_OFF or _is_odometry_noisy(result):

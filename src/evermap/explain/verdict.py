@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite, isnan
+from math import inf, isfinite, isnan, log
 
 from evermap.config import SlamConfig
 from evermap.explain.causes import Inputs
@@ -188,6 +188,9 @@ FEWEST_MOVED = 3
 """Changed landmarks from which a map is outdated: fewer are changes, whatever share they are."""
 SURE = 0.9
 """Probability from which a cause is told as such."""
+PUT_RIGHT, MOST_TURNED = frozenset({"clock", "turn-bias", "turn-scale"}), 0.3
+"""Causes that leave a solution right that has taken them in; and the logarithm of a scale from which turns are another
+unit, or of another robot."""
 
 
 def with_verdict(
@@ -312,8 +315,10 @@ def _decide(
 
 
 def _is_put_right(cause: Cause) -> bool:
-    """Return whether it is a delay that the estimator found as a state, without a comparison."""
-    return cause.code == "clock" and isnan(cause.nats)
+    """Return whether it is what the estimator found by itself, without a comparison: a delay, or turns that are off."""
+    if cause.code not in PUT_RIGHT or not isnan(cause.nats):
+        return False
+    return cause.code != "turn-scale" or abs(log(cause.value)) < MOST_TURNED
 
 
 def _is_of_map(cause: Cause) -> bool:

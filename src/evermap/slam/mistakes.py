@@ -24,6 +24,7 @@ from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
 from evermap.slam.gaps import SILENT_S, find_gaps
 from evermap.slam.kernels import pair_residuals, reckoned_motions
+from evermap.slam.ranges import has_range_changed
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -711,12 +712,10 @@ def find_silences(recording: AnyRecording, settings: CheckConfig) -> FloatArray:
     quiet_s = np.concatenate([find_gaps(odometry), _find_standstills(recording)])
     if not len(quiet_s):
         return quiet_s
-    blind = False
-    if not is_in_space(recording):
-        range_m, blind = recording.detections.range_m, bool(np.isnan(recording.detections.bearing_rad).mean() > 0.5)
+    blind = not is_in_space(recording) and bool(np.isnan(recording.detections.bearing_rad).mean() > 0.5)
     first, second = sighting_pairs(recording, settings, with_bearing=not blind)
     if blind:
-        moves = np.abs(np.log(range_m[second] / range_m[first])) > MOVED
+        moves = has_range_changed(recording, first, second)  # type: ignore[arg-type]
     elif len(first) and (pairs := pairs_of(recording, settings)) is not None:
         moves = off(pairs.residual(HONEST, stands=True)[0]) > MOVED
     else:

@@ -21,10 +21,13 @@ from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import BIAS, CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive
-from evermap.types import ANY_BEARING_RAD, UNKNOWN, BoolArray, FloatArray, Recording, landmark_label
+from evermap.types import ANY_BEARING_RAD, UNKNOWN, BoolArray, FloatArray, IntArray, Recording, landmark_label
 
 RANGE_ONLY = "a range without a bearing is located by what is seen later, which is not causal"
 """Why a robot cannot use it while it drives."""
+OF_MEDIAN, CHANGED, SWAY = 0.6745, 3.0, 0.02
+"""Median of the sizes of normal numbers over their standard deviation; standard deviations of a difference from which
+the robot moved; and share of a range by which it may change as a robot stands."""
 
 
 class Ranged(NamedTuple):
@@ -97,6 +100,35 @@ def with_bearings(recording: Recording, settings: SlamConfig) -> tuple[Recording
         remarks.append(f"landmarks that their ranges do not locate not used: {called}")
     seen = replace(seen, bearing_rad=bearing, sigma_bearing_rad=sigma, landmark_id=landmark_id)
     return replace(recording, detections=seen), tuple(remarks)
+
+
+def with_bearings_anew(recording: Recording, settings: SlamConfig) -> Recording:
+    """Return a recording whose odometry is another now with first bearings by it, where `with_bearings` gave some."""
+    seen = recording.detections
+    blind = seen.sigma_bearing_rad >= ANY_BEARING_RAD
+    name, first, row = np.unique(seen.landmark_id, return_index=True, return_inverse=True)
+    first = first[np.bincount(row, ~blind) <= 1.0]  # the only one of a landmark that counts, as a first place
+    blind[first[name[row[first]] != UNKNOWN]] = True
+    blind &= seen.landmark_id != UNKNOWN
+    if not blind.any():
+        return recording
+    unset = replace(seen, bearing_rad=np.where(blind, np.nan, seen.bearing_rad))
+    return with_bearings(replace(recording, detections=unset), settings)[0]
+
+
+def has_range_changed(recording: Recording, first: IntArray, second: IntArray) -> BoolArray:
+    """Return (P,) pairs of detections of a landmark, rows of the recording, whose ranges differ by more than their
+    noise, and by more than a sensor moves on a robot that stands.
+
+    Noise is found by second differences of ranges (medians of them), in which a robot that drives on hardly shows.
+    """
+    seen = recording.detections
+    order = np.lexsort((recording.frames.stamp_s[seen.frame], seen.landmark_id))
+    range_m, name = seen.range_m[order], seen.landmark_id[order]
+    bend_m = np.abs(np.diff(range_m, n=2))[name[2:] == name[:-2]]
+    sigma_m = float(np.median(bend_m)) / (OF_MEDIAN * 6.0**0.5) if len(bend_m) else 0.0
+    least_m = np.maximum(CHANGED * 2.0**0.5 * sigma_m, SWAY * seen.range_m[first])
+    return np.asarray(np.abs(seen.range_m[second] - seen.range_m[first]) > least_m)
 
 
 def _eyes(recording: Recording, stamp_s: FloatArray, settings: SlamConfig) -> tuple[FloatArray, FloatArray]:
