@@ -159,7 +159,8 @@ def _rank(
     """
     shown, *others = (partial(screen, best, inputs, suspects, config) for screen in screens)
     plain = shown()
-    yield [each for each in plain if each[1].of_map and not each[1].is_continuous and each[0] == math.inf]
+    if nowhere := [each for each in plain if each[1].of_map and not each[1].is_continuous and each[0] == math.inf]:
+        yield nowhere
     if best is None or not others or not all(is_near(one, state) for _, one, state in plain):
         yield plain
         for screen in others:
