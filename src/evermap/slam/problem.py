@@ -17,7 +17,7 @@ from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.geometry import se2, se3
 from evermap.slam.base_problem import BaseProblem
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.cleaning import spikes
+from evermap.slam.gaps import spikes
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray, Recording
@@ -129,7 +129,7 @@ class Drive:
 
 
 def find_jumps(stamp_s: FloatArray, velocity: FloatArray) -> BoolArray:
-    """Return (n,) rows of velocities (n, 3) that no robot drives (`cleaning.spikes`).
+    """Return (n,) rows of velocities (n, 3) that no robot drives (`gaps.spikes`).
 
     An estimate that is corrected jumps, and a robot that is carried is elsewhere.
     """
