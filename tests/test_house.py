@@ -188,6 +188,7 @@ SOLVE_BY_THEMSELVES = {
     "slam.misfit": "values of two curves under each width of their prior: no iteration",
     "slam.filter_kernels": "distance of one detection from where a filter expects it: no iteration",
     "slam.ranges": "damped Gauss-Newton of one position from ranges, from many starts at once",
+    "slam.plane": "two numbers of a mount, its tilt, by reweighted least squares",
     "slam.space.starts": "Gauss-Newton of single poses from three points each, of thousands at once",
     "slam.space.drift": "two numbers of an odometry, by expectation-maximisation and reweighted",
     "slam.space.intake": "one point where rays meet, a landmark",

@@ -298,6 +298,24 @@ def test_a_lens_of_which_no_distortion_is_stated_is_named() -> None:
     assert error_m(result, recording, in_map=True) < 0.3 * error_m(as_stated, recording, in_map=True)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1.05, 0.96])
+def test_another_focal_length_is_named_where_lengths_contradict_each_other(times: float) -> None:
+    """Without a map the run would be weak: ranges are off by what the focal length is, and what is across is not."""
+    recording, _ = recorded(World(seed=1), "corners")
+    other = tuple(
+        replace(one, intrinsics=(times * fx, times * fy, cx, cy))
+        for one in recording.sensors
+        for fx, fy, cx, cy in [one.intrinsics or (0.0,) * 4]
+    )
+    result = run_slam(replace(recording, sensors=other))
+    cause = named(result, "focal-length")
+    assert cause.value == pytest.approx((recording.sensors[0].intrinsics or (0.0,))[0], rel=0.005)
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    assert error_m(result, recording, in_map=False) < 0.02
+
+
 @pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_centre_of_the_image_that_is_elsewhere_is_named(mapped: bool) -> None:
     """All else seems sound: noise takes in what the images are off by."""

@@ -11,12 +11,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap.config import SlamConfig
-from evermap.explain.causes import Inputs
+from evermap.explain.causes import Inputs, Suspect, list_suspects
+from evermap.explain.competition import _rank
 from evermap.explain.put_right import find_put_right
+from evermap.explain.screens import _by_shape
 from evermap.explain.shape import compare_shapes
 from evermap.types import Cause, Landmarks, ParameterEstimate
 
 from .worlds import World
+
+CONFIG = SlamConfig()
 
 
 def flat(count: int, spread_m: float, sigma_m: float = 0.001) -> Landmarks:
@@ -104,3 +108,33 @@ def test_without_identities_a_map_of_another_site_is_not_one_of_other_identities
     assert [one.code for one in find_put_right(result, Inputs.of(recording, other), config)] == [code]
     few: Any = SimpleNamespace(**{**vars(result), "landmarks": flat(4, 3.0)})
     assert len(find_put_right(few, Inputs.of(recording, other), config)) == (unknown_ids is not True)
+
+
+def test_a_map_of_another_site_is_asked_before_all_else() -> None:
+    """Nothing of it is in its place, in no scale either; one that is larger is of this site, whatever it is."""
+    world = World(seconds=4.0)
+    recording, found = world.plane(), flat(12, 6.0)
+    here = replace(found, position_m=found.position_m[np.random.default_rng(1).permutation(12)] * 1.3)
+    larger = replace(found, position_m=1.4 * found.position_m)
+    alone: Any = SimpleNamespace(landmarks=found)
+    for given, state, expected in ((here, 0.2, ["map-site"]), (larger, -np.log(1.4), []), (larger, 0.0, ["map-site"])):
+        inputs = Inputs.of(recording, given)
+        suspects = list_suspects(inputs)
+        scale = next(one for one in suspects if one.code == "map-scale")
+        asked = _by_shape(alone, inputs, suspects, [(np.inf, scale, state)])
+        assert asked is not None
+        assert [one.code for gain, one, _ in asked if gain == np.inf] == expected
+
+
+def test_a_map_that_lies_nowhere_is_left_out_first() -> None:
+    """And in a turn of its own: no other cause is solved for where it explains all."""
+    site, size, clock = (
+        Suspect(code, "", 1e-3, lambda inputs, _: inputs, str, str, sigma, of_map=of_map)
+        for code, sigma, of_map in (("map-site", 0.0, True), ("tag-size", 0.3, False), ("clock", 0.5, False))
+    )
+    asked: Any = ([(np.inf, size, 0.2), (np.inf, site, 0.0)], [(9.0, clock, 0.1)])
+    screens = [lambda *_, found=found: found for found in asked]
+    nothing: Any = None
+    turns = [[one.code for _, one, _ in turn] for turn in _rank(nothing, nothing, [], CONFIG, screens)]
+    assert turns[0] == ["map-site"]
+    assert turns[1:] == [["tag-size", "map-site"], ["clock"]]

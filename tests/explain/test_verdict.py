@@ -6,11 +6,17 @@ import re
 from dataclasses import replace
 from math import inf
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evermap import run_slam
+from evermap.config import SlamConfig
+from evermap.explain import verdict
+from evermap.explain.causes import Suspect
+from evermap.explain.scores import CalibrationScore, SessionScores
 from evermap.explain.symptoms import Signs, measure_signs
 from evermap.explain.verdict import LIMITS, SURE, Limit, judge_signs
 from evermap.types import (
@@ -28,6 +34,8 @@ from evermap.viz.verdict_words import cause_text, further_causes
 from evermap_studies.worlds.lasers import LaserWorld, simulate_laser
 
 GOOD = Signs(n_landmarks=12, n_used=500, nis=2.0, used=0.98, sigma_m=0.02, size_m=10.0)
+
+SESSION: Any = object()
 
 
 def recorded() -> tuple[Recording, Landmarks]:
@@ -218,6 +226,34 @@ def test_noise_far_beyond_what_is_usual_is_weak() -> None:
                 replace(one, value=ratio * one.prior_mean) if one.name == name else one for one in result.parameters
             )
             assert (code in alarms(replace(result, parameters=levels), recording)) is expected
+
+
+@pytest.mark.parametrize(
+    ("signs", "kind"),
+    [
+        (GOOD, VerdictKind.SENSOR_SUSPECT),
+        (replace(GOOD, away_scale=4.0), VerdictKind.SENSOR_SUSPECT),  # weak, for lengths that contradict each other
+        (replace(GOOD, nis=9.0), VerdictKind.LOST),  # scores at what is no solution say nothing
+    ],
+)
+def test_a_run_that_is_weak_is_asked_what_it_held(
+    signs: Signs, kind: VerdictKind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A focal length that is another makes lengths by odometry and by detections differ."""
+    recording, survey = recorded()
+    asked = list[object]()
+    focal = Suspect("focal-length", "front", 1e-3, lambda inputs, _: inputs, lambda _: "another focal length", str, 0.1)
+    scores = SessionScores((CalibrationScore(focal, -0.05, 0.001, 300.0, 4.5),))
+    monkeypatch.setattr(verdict, "measure_signs", lambda *_: signs)
+    monkeypatch.setattr(verdict, "score_session", lambda session, *_: (asked.append(session), scores)[1])
+    result: Any = SimpleNamespace(parameters=(), causes=(), trajectory=None)
+    found = verdict.judge(result, recording, SlamConfig(), survey, session=SESSION)
+    assert found.kind is kind
+    assert asked == ([] if kind is VerdictKind.LOST else [SESSION])
+    if kind is VerdictKind.SENSOR_SUSPECT:
+        assert "another focal length" in found.message
+    without = verdict.judge(result, recording, SlamConfig(), survey)  # nothing to ask
+    assert without.kind is judge_signs(signs).kind
 
 
 def test_limits_are_those_of_the_documentation() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from problems import World, make_world
 
-from evermap.slam.problem import Problem
+from evermap.config import OdometryConfig
+from evermap.slam.problem import Drive, Problem
 
 COVARIANCE = np.cov(np.random.default_rng(0).normal(size=(10, 60)))
 
@@ -65,3 +66,42 @@ def test_two_places_tied_to_each_other_but_to_nothing_else():
     assert prior.given.tolist() == [1]
     assert prior.information == pytest.approx(np.eye(2) / 0.2**2)
     assert prior.gain == pytest.approx(np.eye(2))
+
+
+SILENT = OdometryConfig(silence_s=1.0, silent_variance=0.25, longest_silence_s=60.0)
+
+
+def driven(
+    jump_row: int | None = None, by: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows every 50 ms at 1 m/s, which speeds up by 15 m/s^2 at first; one row is another velocity."""
+    velocity = np.tile([1.0, 0.0, 0.1], (40, 1))
+    velocity[:4, 0] = [0.25, 0.5, 0.75, 1.0]
+    if jump_row is not None:
+        velocity[jump_row] += by
+    return 0.05 * np.arange(40), velocity
+
+
+@pytest.mark.parametrize("by", [(18.0, 0.0, 0.0), (0.0, -6.0, 0.0), (0.0, 0.0, 9.0)])
+def test_a_step_that_no_robot_drives_may_be_none(by):
+    """Over 50 ms the standard deviation is the step: of 18 m/s, .9 m."""
+    drive = Drive.from_rows(*driven(20, by), SILENT)
+    expected = np.zeros(41)
+    step = 0.05 * (np.array([1.0, 0.0, 0.1]) + by)
+    expected[20], expected[40] = (step**2).sum() / 0.05, 0.25
+    assert drive.unknown == pytest.approx(expected)
+    assert drive.velocity[20, :3] == pytest.approx([1.0 + by[0], by[1], 0.1 + by[2]])  # dead reckoning follows it
+
+
+@pytest.mark.parametrize("by", [(1.9, 0.0, 0.0), (0.0, 0.0, -1.9), (0.0, 0.0, 0.0)])
+def test_what_a_robot_drives_is_known(by):
+    assert not Drive.from_rows(*driven(20, by), SILENT).unknown[:40].any()
+
+
+def test_a_jump_before_a_silence_lasts_a_step_and_tells_no_speed():
+    stamp_s, velocity = driven(20, (30.0, 0.0, 0.0))
+    drive = Drive.from_rows(np.append(stamp_s[:21], stamp_s[21:] + 5.0), velocity, SILENT)
+    assert drive.stamp_s[20:23] == pytest.approx([1.0, 1.05, 6.05])
+    assert drive.unknown[20] == pytest.approx((31.0**2 + 0.1**2) * 0.05)
+    assert drive.unknown[21] == pytest.approx(0.25 + (1.0 + 0.1**2) * 5.05)  # by the speed before
+    assert not drive.velocity[21].any()

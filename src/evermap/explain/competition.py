@@ -167,10 +167,14 @@ def _rank(
     screens: Sequence[Callable[..., Asked]],
 ) -> Iterable[Asked]:
     """Yield causes to solve for in turns, as each of the `screens` lets them through, the first what shows without a
-    solution, and before that the one that leads; there is no need for the next turn where one explains all.
+    solution, and before that the one that leads; there is no need for the next turn where one explains all. Before all
+    else a map that lies nowhere on what was seen is left out: the session alone is solved in no time, while every other
+    cause is asked in a map that contradicts it.
     """
     shown, *others = (partial(screen, best, inputs, suspects, config) for screen in screens)
     plain = shown()
+    if nowhere := [each for each in plain if each[1].of_map and not each[1].is_continuous and each[0] == math.inf]:
+        yield nowhere
     if best is None or not others or not all(is_near(one, state) for _, one, state in plain):
         yield plain
         for screen in others:

@@ -61,16 +61,19 @@ def screen_plain(
     alone: SlamResult | None = None,
 ) -> list[tuple[float, Suspect, float]]:
     """Return causes that show without a solution, in one that fails, or in one without the map, `alone`."""
-    of_map = _by_shape(alone, inputs, suspects)
+    seeds = _by_seeds(best, inputs, suspects, config)
+    of_map = _by_shape(alone, inputs, suspects, seeds)
     if of_map is None:
         of_map = [(0.0, one, 0.0) for one in suspects if _is_of_map(one, best, config)]
-    seeds = _by_seeds(best, inputs, suspects, config)
     shown = [(math.inf, one, 0.0) for one in suspects if one.shows]
     return [*shown, *screen_pairs(inputs, suspects, config), *seeds, *of_map]
 
 
-def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspect]) -> Asked | None:
-    """Return discrete causes of the map after which more of it is in its place; None where its shape says nothing."""
+def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspect], seeds: Asked) -> Asked | None:
+    """Return discrete causes of the map after which more of it is in its place; None where its shape says nothing.
+
+    Where none of it is, in no scale of the `seeds` either, that it is of another site is for certain worth a solution.
+    """
     if alone is None or inputs.prior_map is None:
         return None
     as_given = compare_shapes(alone.landmarks, inputs.prior_map)
@@ -82,13 +85,16 @@ def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspe
             continue
         undone = suspect.undo(inputs, 0.0).prior_map
         if undone is None:
-            elsewhere.append((0.0, suspect, 0.0))
+            elsewhere.append((math.inf, suspect, 0.0))
             continue
         now = compare_shapes(alone.landmarks, undone)
         placed = max(placed, now.placed)
         if now.placed >= PLACED and now.share > as_given.share + BETTER:
             found.append((now.share + suspect.p, suspect, 0.0))
     found.sort(key=lambda each: -each[0])
+    for _, suspect, state in seeds:
+        if suspect.of_map and (undone := suspect.undo(inputs, state).prior_map) is not None:
+            placed = max(placed, compare_shapes(alone.landmarks, undone).placed)
     return found if placed > ELSEWHERE else elsewhere
 
 

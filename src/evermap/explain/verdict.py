@@ -233,13 +233,14 @@ def judge(
         findings: what `slam.check` found odd about the readings alone.
         set_aside: why a session could not be localised in its map; '' where it was, or there is none.
         as_read: the recording with the identities that it was read with; None where they are the same.
-        session: the solution that the result is of. If all else is sound, it is asked what it held as stated.
+        session: the solution that the result is of. If all else is sound or weak, it is asked what it held as stated:
+            what makes a run weak, lengths that contradict each other, may be what that does.
     """
     signs = measure_signs(result, recording, prior_map, as_read)
     wrong = [finding.message for finding in findings if not finding.usable]
     suspicions = [*wrong, *far_off(result.parameters, settings.check)]
     found = judge_signs(signs, suspicions, result.causes, set_aside)
-    if found.kind is not VerdictKind.SOUND or session is None:
+    if found.kind not in (VerdictKind.SOUND, WEAK) or session is None:
         return found
     scores = score_session(session, Inputs.of(recording, prior_map), result.trajectory)
     return judge_signs(with_scores(signs, scores), suspicions, result.causes, set_aside)

@@ -20,7 +20,8 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.square import with_square_poses
 from evermap.show import Shown
-from evermap.slam.cleaning import clean, spikes
+from evermap.slam.cleaning import clean
+from evermap.slam.gaps import spikes
 from evermap.slam.mistakes import (
     HONEST,
     USUAL,

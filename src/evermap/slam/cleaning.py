@@ -13,6 +13,7 @@ import numpy as np
 
 from evermap.config import CleaningConfig
 from evermap.errors import DataError
+from evermap.slam.gaps import running_median, spikes
 from evermap.slam.mistakes import LEAST_STEP_S, clock_steps
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 from evermap.valid import LATEST_S
@@ -71,18 +72,6 @@ def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) 
     spike = spikes(odometry.stamp_s, velocity, settings)
     _remark(remarks, "odometry rows with a spike dropped", int(np.sum(spike)))
     return rows_of(odometry, ~spike)
-
-
-def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) -> BoolArray:
-    """Return (N,) which velocities (K, N) differ from those around them by more than a robot can accelerate."""
-    if len(stamp_s) < 3:
-        return np.zeros(len(stamp_s), dtype=np.bool_)
-    step_s = np.diff(stamp_s)
-    step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
-    step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
-    usual = np.stack([running_median(column, settings.around) for column in velocity])
-    most = np.maximum(settings.hardest * step_s, settings.sharpest)
-    return np.asarray(np.any(np.abs(velocity - usual) > most, axis=0))
 
 
 def of_ranges_only(detections: Detections, settings: CleaningConfig) -> bool:
@@ -313,14 +302,6 @@ def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray,
     set_back = fall < -settings.step_s
     stamps[found] = told - np.cumsum(np.where(set_back, fall, 0.0))
     return stamps, -fall[set_back]
-
-
-def running_median(values: FloatArray, around: int) -> FloatArray:
-    """Return (N,) the median of the `around` values centred on each; ends are padded with their values."""
-    if len(values) == 0:
-        return values
-    padded = np.pad(values, around // 2, mode="edge")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1))
 
 
 def set_forward(stamp_s: FloatArray, other_s: FloatArray, settings: CleaningConfig) -> tuple[int, float] | None:

@@ -1,9 +1,10 @@
-"""Gaps of an odometry: times of which it says nothing."""
+"""Gaps of an odometry, times of which it says nothing, and its spikes, of which what it says cannot be."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from evermap.config import CleaningConfig
 from evermap.types import BoolArray, FloatArray, Odometry, SpatialOdometry
 
 SILENT_S, FEW_STEPS = 2.0, 10.0
@@ -25,3 +26,23 @@ def is_outside(gaps_s: FloatArray, start_s: FloatArray, stop_s: FloatArray) -> B
     for since_s, until_s in gaps_s.tolist():
         found &= (start_s >= until_s) | (stop_s <= since_s)
     return found
+
+
+def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) -> BoolArray:
+    """Return (N,) which velocities (K, N) differ from those around them by more than a robot can accelerate."""
+    if len(stamp_s) < 3:
+        return np.zeros(len(stamp_s), dtype=np.bool_)
+    step_s = np.diff(stamp_s)
+    step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
+    step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
+    usual = np.stack([running_median(column, settings.around) for column in velocity])
+    most = np.maximum(settings.hardest * step_s, settings.sharpest)
+    return np.asarray(np.any(np.abs(velocity - usual) > most, axis=0))
+
+
+def running_median(values: FloatArray, around: int) -> FloatArray:
+    """Return (N,) the median of the `around` values centred on each; ends are padded with their values."""
+    if len(values) == 0:
+        return values
+    padded = np.pad(values, around // 2, mode="edge")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1))

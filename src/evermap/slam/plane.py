@@ -2,7 +2,7 @@
 
 **It can be in the plane** if the odometry moves at one height without roll and pitch, and landmarks keep their heights
 above the floor, seen through the mounts: those of a sensor whose mount is wrong do not, nor do those of a robot whose
-odometry leaves ramps out.
+odometry leaves ramps out. A mount that is tilted a little is seen by heights that go with the distance.
 
 **It is in the plane** if in addition detections are positions, with or without orientations: the calibration of wheels
 that only the plane has is worth more than what orientations say (twice as exact where wheels have usual errors). Tags
@@ -50,6 +50,13 @@ HEIGHT_SHARE = 0.1
 MOST_OF_HEIGHTS, NOISE_OF_HEIGHTS = (0.05, 0.95), 4.0
 """Quantiles between which measured heights and tilts differ on a ramp, by more than so many standard deviations (of
 Gaussian noise they are 3.3 apart): some may be wrong."""
+TILT_RAD, TILT_SIGMAS = 0.05, 4.0
+"""Tilt of a mount that landmarks show which rise or sink as they come nearer, beyond which it is another than stated,
+and standard deviations that it must be known to: it is asked in space, and the plane has no room for it."""
+CAUCHY = 2.385
+"""Residual over its scale from which Cauchy's weights fall, for an efficiency of .95."""
+ROUNDS = 5
+"""Rounds of weighted least squares."""
 FEWEST_LANDMARKS = 3
 """Landmarks whose heights must be known to show a floor."""
 OVERHEAD = 0.1
@@ -139,12 +146,39 @@ def is_on_floor(recording: SpatialRecording, settings: CheckConfig) -> bool:
         return False
     if not _is_level_by_measurements(recording):
         return False
-    height, range_m = _on_floor(recording)[:, 2], np.linalg.norm(positions_of(recording), axis=1)
+    at, range_m = _on_floor(recording), np.linalg.norm(positions_of(recording), axis=1)
+    sensor = recording.detections.sensor
     first, second = sighting_pairs(recording, settings)
     if len(first) < settings.fewest or len(np.unique(recording.detections.landmark_id[first])) < FEWEST_LANDMARKS:
         return False
-    apart = np.abs(height[first] - height[second]) / np.maximum(range_m[first], range_m[second])
-    return bool(np.median(apart) < HEIGHT_SHARE)
+    apart = at[second] - at[first]
+    apart /= np.maximum(range_m[first], range_m[second])[:, None]
+    if not np.median(np.abs(apart[:, 2])) < HEIGHT_SHARE:
+        return False
+    same = sensor[first] == sensor[second]
+    return not any(is_tilted(apart[same & (sensor[first] == row)]) for row in np.unique(sensor))
+
+
+def is_tilted(apart: FloatArray) -> bool:
+    """Return whether a mount is tilted against what is stated, by how landmarks seem to move in the robot's frame.
+
+    Heights of landmarks stay. Seen through a mount that is tilted they rise or sink with the way to the front and to
+    the side: two slopes, by weighted least squares of which outliers are let go (Cauchy).
+
+    Args:
+        apart: (K, 3) between two sightings of a landmark each, by one sensor, over the range.
+    """
+    if len(apart) <= 2 or np.linalg.matrix_rank(apart[:, :2]) < 2:
+        return False
+    along, weight = apart[:, :2], np.ones(len(apart))
+    for _ in range(ROUNDS):
+        information = along.T @ (weight[:, None] * along)
+        tilt = np.linalg.solve(information, along.T @ (weight * apart[:, 2]))
+        left = apart[:, 2] - along @ tilt
+        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        weight = 1.0 / (1.0 + (left / (CAUCHY * scale)) ** 2)
+    sigma = scale * np.sqrt(np.diag(np.linalg.inv(information)))
+    return bool((np.abs(tilt) > np.maximum(TILT_RAD, TILT_SIGMAS * sigma)).any())
 
 
 def _is_level_by_measurements(recording: SpatialRecording) -> bool:

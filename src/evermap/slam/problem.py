@@ -10,13 +10,14 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from evermap.config import OdometryConfig
+from evermap.config import CleaningConfig, OdometryConfig
 from evermap.errors import DataError
 from evermap.estimate.sparse.elimination import Spread
 from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.geometry import se2, se3
 from evermap.slam.base_problem import BaseProblem
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.gaps import spikes
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray, Recording
@@ -28,6 +29,8 @@ TURN_ROWS = 5
 """Rows of odometry in a span from which its jitter is told."""
 SPANS = 2
 """Spans `turn_s` until a row, of which the calmest tells the jitter: a turn that begins or ends is none."""
+LIMITS = CleaningConfig()
+"""What no robot drives."""
 TRIMMED = 0.6234
 """Mean of a squared standard normal below its 90 % quantile."""
 
@@ -102,22 +105,37 @@ class Drive:
 
         What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
         to that of `longest_silence_s`. Stamps (n,) strictly increase; velocities are (n, 3) forward, lateral, turn, or
-        (n, 4) with what is known of the turn's jitter.
+        (n, 4) with what is known of the turn's jitter. A step that no robot
+        drives may be what the odometry says, or none: its standard deviation is itself.
         """
         if velocity.shape[1] == 3:
             velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2], settings)])
-        silence, unknown = np.diff(stamp_s), np.zeros(len(stamp_s))
+        silence, jumps = np.diff(stamp_s), find_jumps(stamp_s, velocity[:, :3])
+        usual_s = np.minimum(silence, np.median(silence)) if len(silence) else silence
+        unknown = np.where(jumps, (velocity[:, :3] ** 2).sum(axis=1) * np.append(usual_s, 0.0), 0.0)
         if len(silent := np.flatnonzero(silence > settings.silence_s)):
             at = silent + 1
             counted = np.minimum(silence[silent], settings.longest_silence_s)
-            rate = settings.silent_variance + (velocity[silent, :3] ** 2).sum(axis=1) * counted
+            last = np.maximum(silent - jumps[silent], 0)
+            rate = settings.silent_variance + (velocity[last, :3] ** 2).sum(axis=1) * counted
             rate = rate * counted / silence[silent]
             unknown = np.insert(unknown, at, rate)
-            stamp_s = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * settings.silence_s)
+            held_s = np.where(jumps[silent], usual_s[silent], 0.5 * settings.silence_s)
+            stamp_s = np.insert(stamp_s, at, stamp_s[silent] + held_s)
             velocity = np.insert(velocity, at, 0.0, axis=0)
         # after the last row nothing is known either
         stamps = np.append(stamp_s, stamp_s[-1] + 0.5 * settings.silence_s)
         return cls(stamps, np.vstack([velocity, np.zeros(4)]), np.append(unknown, settings.silent_variance))
+
+
+def find_jumps(stamp_s: FloatArray, velocity: FloatArray) -> BoolArray:
+    """Return (n,) rows of velocities (n, 3) that no robot drives (`gaps.spikes`).
+
+    An estimate that is corrected jumps, and a robot that is carried is elsewhere.
+    """
+    if len(stamp_s) < 3 or np.ptp(velocity, axis=0).max() <= LIMITS.sharpest:
+        return np.zeros(len(stamp_s), dtype=np.bool_)
+    return spikes(stamp_s, velocity.T, LIMITS)
 
 
 def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray, settings: OdometryConfig = USUAL) -> FloatArray:

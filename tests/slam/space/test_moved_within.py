@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evermap import run_slam
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space.against_map import MapComparison
+from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map
 from evermap.types import ChangeKind, Frames, SlamResult, SpatialRecording
 
 from .corridors import Move, World, as_poses, tagged_corridor
@@ -131,3 +134,13 @@ def test_nothing_moved_where_the_camera_is_late_or_identities_are_wrong(seed, la
     world = tagged_corridor(seed, p_wrong=0.03)
     frames = Frames(world.recording.frames.stamp_s + late_s)
     assert not run_slam(replace(world.recording, frames=frames)).changes
+
+
+@pytest.mark.parametrize(("n_off", "is_in_doubt"), [(0, False), (5, False), (6, True), (10, True)])
+def test_a_map_of_which_most_is_elsewhere_is_in_doubt_not_its_landmarks(n_off: int, is_in_doubt: bool) -> None:
+    """Of ten places of a map; without a map nothing contradicts it."""
+    p_stands = np.where(np.arange(10) < n_off, 0.49, 0.51)
+    found = MapComparison(p_stands, np.zeros((10, 6)), np.zeros((10, 6, 6)), 1.0)
+    unused: Any = None
+    assert _contradicts_map(SpatialExplanation(unused, np.arange(10), (), found)) is is_in_doubt
+    assert not _contradicts_map(SpatialExplanation(unused, np.arange(10), (), None))

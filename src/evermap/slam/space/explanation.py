@@ -24,6 +24,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 SPLITS = 2
 """Times that landmarks are split."""
+STANDS, MOST_OFF_MAP = 0.5, 0.5
+"""Probability that a place of a map stands, and share of those that do not, from which the map is in doubt."""
 MOST_PLACES = 2
 """Places of one landmark that a move explains."""
 
@@ -62,6 +64,8 @@ def explain_places(
     asked, interval = ~whole, (changes or ChangesConfig()).interval
     gain_nats = optimum.smoother.problem.settings.repair.gain_nats
     for _ in range(ROUNDS):
+        if _contradicts_map(found):
+            break
         suspects = list_movers(found.optimum, found.identity, asked, _off_map(found))
         if not len(suspects) or (two := find_two_places(begun, suspects, interval)) is None:
             break
@@ -136,6 +140,14 @@ def _log_evidence(explanation: SpatialExplanation, begun: SpatialNoise, lasting:
         found += sum(log_map_density(problem, explanation.from_map, optimum.estimate.place))
     twice = np.count_nonzero(seen) - len(np.unique(identity[seen]))
     return found + twice * math.log(problem.settings.map.p_moved)
+
+
+def _contradicts_map(explanation: SpatialExplanation) -> bool:
+    """Return whether most of a map is not where it should be: then it is the map that is in doubt, and a landmark that
+    moved while the robot drove can't be told from one that the map has elsewhere.
+    """
+    found = explanation.from_map
+    return found is not None and bool(len(found.p_stands)) and float(np.mean(found.p_stands < STANDS)) > MOST_OFF_MAP
 
 
 def _off_map(explanation: SpatialExplanation) -> IntArray:

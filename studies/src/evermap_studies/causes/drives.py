@@ -513,7 +513,7 @@ def _in_plane(
     pose[:, 2] = se2.wrap(pose[:, 2])
     return Recording(
         name=drive.name,
-        odometry=Odometry(drive.odometry_s, drive.twist[:, 0], drive.twist[:, 1], drive.twist[:, 5]),
+        odometry=Odometry(drive.odometry_s, drive.twist[:, 0], drive.twist[:, 1], drive.twist[:, 5], is_measured=True),
         frames=Frames(stamp_s),
         detections=detections,
         sensor=Sensor(
