@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError, DataError, InputError
-from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, is_in_space
+from evermap.types import AnyRecording, IntArray, Landmarks, Progress, Recording, SlamResult, is_in_space
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
@@ -52,12 +54,14 @@ def run_slam(
     from evermap.slam.moving_bodies import without_motion
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.up import with_known_up
+    from evermap.slam.votes import list_doubled_ids
 
     config = config or Config()
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     read, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
     recording, remarks, found = check.screened(read, config, prior_map)
     remarks, found = (*(one.message for one in riders), *told, *remarks), (*riders, *found)
+    doubled = list_doubled_ids(read, recording)
     if config.slam.unknown_ids and prior_map is not None:
         recording, evidence = nameless.identify_in(recording, prior_map, config)
     else:
@@ -77,9 +81,10 @@ def run_slam(
         visit, result, under = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
         result = replace(session.existing(visit, result, config.living), association=evidence)
         if prior_map is not None:
-            result = with_known_up(session.looked_for(visit, result, prior_map, config.living), prior_map.up)
-        solution = session.solution_of(visit)
-        return _judge(result, under.recording, config, under.prior_map, found, as_read=read, session=solution)
+            expected = prior_map[~np.isin(prior_map.landmark_id, doubled)]  # what was read was not missed
+            result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
+        told = under.recording, config, under.prior_map, found, doubled
+        return _judge(result, *told, as_read=read, session=session.solution_of(visit))
 
     result = conclude(realtime=realtime, progress=progress)
     if result.causes or realtime or not config.slam.explain.on or not _is_held(result):
@@ -99,13 +104,14 @@ def _judge(
     config: Config,
     expected: Landmarks | None,
     found: tuple[Finding, ...],
+    doubled: IntArray | tuple[int, ...] = (),
     **more: Any,
 ) -> SlamResult:
     """Return a result with the faults that it shows, and its verdict; `more` is as of `with_verdict`."""
     from evermap.explain.faults import find_faults, with_mended
     from evermap.explain.verdict import with_verdict
 
-    faults, mended = find_faults(result, recording, found, expected)
+    faults, mended = find_faults(result, recording, found, expected, doubled)
     result = replace(result, causes=(*result.causes, *faults))
     result = with_verdict(result, recording, config.slam, expected, findings=found, **more)
     return with_mended(result, mended)

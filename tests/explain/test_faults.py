@@ -168,6 +168,44 @@ def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
 
 
+def renamed(recording: Any, names: dict[int, int], until_s: float = np.inf) -> Any:
+    """Landmarks with the identity of another one, until an instant."""
+    seen, own = recording.detections, recording.detections.landmark_id.copy()
+    early = recording.frames.stamp_s[seen.frame] < until_s
+    for one, name in names.items():
+        own[early & (seen.landmark_id == one)] = name
+    return replace(recording, detections=replace(seen, landmark_id=own))
+
+
+@pytest.mark.parametrize("make", [in_plane, in_space])
+@pytest.mark.parametrize("in_map", [False, True])
+def test_an_identity_on_two_landmarks_is_named(make: Any, in_map: bool) -> None:
+    """At both ends of the field, which the robot passes in turns: 12 m are between them."""
+    recording, world = make(), World(seed=4)
+    given = world.map_in_plane() if make is in_plane else world.map_in_space()
+    result = run_slam(renamed(recording, {14: 11}), prior_map=given if in_map else None)
+    (cause,) = result.causes
+    assert (cause.code, cause.subject) == ("double-identity", "11")
+    if make is in_plane:
+        assert cause.value == pytest.approx(np.linalg.norm((world.place[14] - world.place[11])[:2]), abs=0.1)
+        assert "at two places in turns" in cause.message
+    else:  # two cameras read both at once
+        assert np.isnan(cause.value)
+        assert "at two places at once" in cause.message
+    assert result.verdict is not None
+    assert result.verdict.causes == (cause,)
+    assert not result.changes or {change.landmark_ids for change in result.changes} == {(14,)}
+
+
+@pytest.mark.parametrize("make", [in_plane, in_space])
+def test_an_identity_that_is_read_elsewhere_is_not_on_two_landmarks(make: Any) -> None:
+    """One that another landmark carries, for a while: that one is read wrongly; and one that was carried off once."""
+    recording = make()
+    some = renamed(recording, {14: 11}, until_s=6.0)
+    names = [cause.code for cause in run_slam(some).causes]
+    assert "double-identity" not in names
+
+
 @pytest.mark.slow
 def test_images_of_another_size_than_those_of_the_calibration_are_named() -> None:
     recording = in_space()

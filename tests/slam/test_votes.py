@@ -13,7 +13,7 @@ from space.test_range_noise import LAWS, field
 from evermap import run_slam
 from evermap.config import Config, SlamConfig, VotesConfig
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.slam.votes import Read, contradicted, without_contradicted_ids
+from evermap.slam.votes import Read, contradicted, list_doubled_ids, without_contradicted_ids
 from evermap.types import UNKNOWN, AnyRecordingT, IntArray
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.park import ParkConfig, simulate_park
@@ -86,8 +86,16 @@ def test_an_id_on_two_landmarks_is_not_used_and_named():
     assert np.array_equal(found.detections.landmark_id == UNKNOWN, np.isin(true, (one, other)))
     assert f"landmark_id {one}: on two landmarks" in found.warnings[-1]
     assert recording.truth is not None
+    assert list_doubled_ids(twins, found).tolist() == [one]
+    assert list_doubled_ids(recording, recording).tolist() == []
+    nameless = with_ids(twins, np.where(true == other, UNKNOWN, true))
+    named = with_ids(twins, np.where(true == other, one, true))
+    assert list_doubled_ids(nameless, named).tolist() == []
+    none = with_ids(twins, np.where(twins.detections.landmark_id == 7, UNKNOWN, twins.detections.landmark_id))
+    assert list_doubled_ids(twins, none).tolist() == []  # it was never read twice in a view
     result = run_slam(twins)
     assert found.warnings[-1] in result.warnings
+    assert [(cause.code, cause.subject) for cause in result.causes] == [("double-identity", str(one))]
     off = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=2.0).rmse_m
     assert off < 1.5 * rmse_m(recording)
 

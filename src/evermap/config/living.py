@@ -157,6 +157,9 @@ class LooksConfig(Section):
     )
     lasting: Share = rule(0.5, "share of the places hidden in a session that are hidden in all earlier ones")
     sticky: float = rule(2.0, "consecutive frames that count as one independent one", ge=1.0)
+    fewest_beats: Count = rule(20, "views with detections that tell how often a sensor looks")
+    most_beats: Count = rule(30, "looks in a row that see nothing until it is not known any more when it looks")
+    off_beat: Share = rule(0.1, "share of the time between two looks by which stamps may be off")
     flank_rad: Positive = rule(
         0.7, "angle within which something is seen on both sides of what a map has and is missed [rad]"
     )

@@ -108,6 +108,9 @@ class ChangesConfig(Section):
 
     p_moved: float = key(0.01, "prior probability that anything moved at all", gt=0, lt=1)
     move_sigma_m: Positive = key(0.7, "standard deviation of a displacement, each axis [m]")
+    far: float = rule(10.0, "how much farther some things are moved than most, across the room", gt=1.0)
+    p_far: Share = rule(0.1, "share of things that are")
+    body_m: Positive = rule(0.5, "usual distance of two landmarks on a body that turned [m]")
     p_rotated: Probability = rule(0.1, "share of moves with a rotation")
     turn_sigma_rad: Positive = rule(0.5, "standard deviation of such a rotation [rad]")
     rigid_m: Positive = rule(0.005, "members of a group keep their distances to within this [m]")

@@ -1,5 +1,5 @@
-"""What readings and one solution show to be wrong without a comparison: jumps and silences of the odometry, and corners
-of tags that are listed clockwise; and whether the solution has put it right.
+"""What readings and one solution show to be wrong without a comparison: jumps and silences of the odometry, corners of
+tags that are listed clockwise, and identities on two landmarks; and whether the solution has put it right.
 
 The estimator bridges both by what is seen: a step that no robot drives is an outlier of the odometry, and within a gap
 it may go anywhere. Where the poses are as well known for all that, the cause is told, and nothing is wrong with the
@@ -10,11 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import degrees, nan
+from math import degrees, isnan, nan
 
 import numpy as np
 
-from evermap.explain.symptoms import USED, find_motions, find_turns_between
+from evermap.explain.symptoms import (
+    PER_LANDMARK,
+    USED,
+    compare_detections,
+    find_motions,
+    find_poses_at,
+    find_turns_between,
+)
+from evermap.geometry import se2, se3
 from evermap.slam.check import CLOCKWISE, CORNERS, RIDER, SILENCE, is_clockwise
 from evermap.slam.gaps import find_gaps, is_outside
 from evermap.slam.mistakes import Finding
@@ -42,9 +50,19 @@ POORLY, LEAST_M = 5.0, 0.02
 """Standard deviation of positions during a silence, over the usual one, from which they are not known, and the least
 [m]."""
 
+APART_M, SCATTERS = 0.3, 5.0
+"""Distance of two landmarks of one identity, at least [m], and over what sightings of a landmark scatter by."""
+TURNS, AT_ONCE = 3, 2
+"""Times that an identity is seen at the one place, then at the other: what was carried off and brought back makes two.
+Or frames that show both, which a wrong reading may do once."""
+
 
 def find_faults(
-    result: SlamResult, recording: AnyRecording, findings: Sequence[Finding], prior_map: Landmarks | None
+    result: SlamResult,
+    recording: AnyRecording,
+    findings: Sequence[Finding],
+    prior_map: Landmarks | None,
+    doubled: Sequence[int] | IntArray = (),
 ) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
     """Return causes that leave poses unknown or a new map wrong, and those that the solution has put right.
 
@@ -53,16 +71,19 @@ def find_faults(
         recording: as it was estimated, without rows of the odometry that say nothing.
         findings: what `slam.check` found of it.
         prior_map: that was given, or what a living map expected; it tells in which order corners are.
+        doubled: identities that were read at two places at once, and are not used.
     """
     order = _order_of_corners(result, recording, prior_map)
-    riders = tuple(_rider(finding) for finding in findings if finding.code == RIDER)
+    names = [(recording.landmark_names.get(int(one), str(one)), nan) for one in doubled]
+    riders = (_rider(finding) for finding in findings if finding.code == RIDER)
+    mended = (*riders, *(_double(*each) for each in [*names, *find_doubles(result, recording)]))
     silent = [finding for finding in findings if finding.code == SILENCE]
     if recording.odometry is None or len(result.trajectory) < 3:
-        return order, riders
+        return order, mended
     gaps_s = find_gaps(recording.odometry)
     start_s = float(recording.odometry.stamp_s[0])
     jumps = find_jumps(result, gaps_s)
-    told = [*riders, *(_jump(*jump, start_s, len(jumps)) for jump in jumps[:1])]
+    told = [*mended, *(_jump(*jump, start_s, len(jumps)) for jump in jumps[:1])]
     if not jumps and (unseen := find_unseen_jumps(result, gaps_s)):
         order = (*order, _jump(*unseen[0], start_s, len(unseen), "while nothing was seen, so that nobody knows when"))
     if not silent or not len(gaps_s):
@@ -91,6 +112,49 @@ def _order_of_corners(result: SlamResult, recording: AnyRecording, prior_map: La
 
 def _rider(finding: Finding) -> Cause:
     return Cause(RIDER, "detections", finding.message, probability=1.0, fix="detections.csv: none of what rides along")
+
+
+def find_doubles(result: SlamResult, recording: AnyRecording) -> list[tuple[str, float]]:
+    """Return names of identities that are on two landmarks, and how far these are apart [m].
+
+    Both are seen at once, or in turns, so that it is no landmark that moved, and none with another identity stands
+    there, which was misread. The estimator keeps them apart, or leaves out the sightings of the second.
+    """
+    compared = compare_detections(recording, result)
+    pose = find_poses_at(result.trajectory, compared.taken_s)[0]
+    at = (se2 if pose.shape[1] == 3 else se3).transform(pose, compared.point_m)
+    read, places = recording.detections.landmark_id[compared.detection], result.landmarks
+    usable = np.isfinite(at).all(axis=1) & ~np.isin(read, [one for each in result.changes for one in each.landmark_ids])
+    found = list[tuple[str, float]]()
+    for identity in np.unique(read[usable & ~(compared.used & (compared.landmark_id == read))]).tolist():
+        mine = np.flatnonzero(usable & (read == identity))
+        own = mine[compared.used[mine] & (compared.landmark_id[mine] == identity)]
+        if len(own) < PER_LANDMARK:
+            continue
+        first = np.median(at[own], axis=0)
+        radius_m = max(APART_M, SCATTERS * float(np.median(np.linalg.norm(at[own] - first, axis=1))))
+        others = mine[np.linalg.norm(at[mine] - first, axis=1) > radius_m]
+        near = np.linalg.norm(at[others, None] - at[others], axis=2) < radius_m
+        if not len(others) or (count := near.sum(axis=1)).max() < PER_LANDMARK:
+            continue
+        others = others[near[int(np.argmax(count))]]
+        second = np.median(at[others], axis=0)
+        names = np.isin(places.landmark_id, [identity, *compared.landmark_id[mine].tolist()], invert=True)
+        if (np.linalg.norm(places.position_m[names] - second, axis=1) < radius_m).any():
+            continue
+        taken_s = np.concatenate([compared.taken_s[own], compared.taken_s[others]])
+        is_second = np.repeat([False, True], [len(own), len(others)])[np.argsort(taken_s, kind="stable")]
+        at_once = np.intersect1d(compared.taken_s[own], compared.taken_s[others])
+        if len(at_once) >= AT_ONCE or np.count_nonzero(np.diff(is_second)) >= TURNS:
+            name = str(recording.landmark_names.get(identity, identity))
+            found.append((name, float(np.linalg.norm(second - first))))
+    return found
+
+
+def _double(name: str, apart_m: float) -> Cause:
+    where = "at once, and not used" if isnan(apart_m) else f"in turns, {apart_m:.3g} m apart"
+    message = f"two landmarks carry the identity {name}: it is read at two places {where}"
+    return Cause("double-identity", name, message, apart_m, nan, 1.0, "another identity for one of the two")
 
 
 def with_mended(result: SlamResult, mended: tuple[Cause, ...]) -> SlamResult:

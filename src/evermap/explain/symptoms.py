@@ -66,12 +66,14 @@ class Compared:
     """Detections beside where the map expects them, one row each, as a detection would have read them without noise.
 
     Attributes:
+        detection: (K,) row of the recording's detections.
         taken_s, landmark_id, used: (K,) when, by the clock of the poses, of which landmark, and whether it is used.
         range_m: (K,) expected range.
         off: (K, D) detection less expectation over the expected range; of ranges only one number.
         point_m: (K, D) where detections are in the robot's frame; nan where they have a direction or a range only.
     """
 
+    detection: IntArray
     taken_s: FloatArray
     landmark_id: IntArray
     used: BoolArray
@@ -90,8 +92,8 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     innovations, places = result.innovations, result.landmarks
     row, known = _rows_of(places, innovations.landmark_id)
     taken_s = innovations.stamp_s - _find_delays_s(recording, result)
-    pose, near = _poses_at(result.trajectory, taken_s)
-    keep = known & near & (innovations.detection < len(recording.detections))
+    pose, near = find_poses_at(result.trajectory, taken_s)
+    keep = np.flatnonzero(known & near & (innovations.detection < len(recording.detections)))
     detection, row, pose = innovations.detection[keep], row[keep], pose[keep]
     if is_in_space(recording):
         from evermap.slam.space.intake import positions_of, without_range
@@ -116,10 +118,8 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
         expected = _points(range_m, expected[:, 1])
     off = (read - expected) / np.maximum(range_m, 1e-9)[:, None]
     good = np.isfinite(off).all(axis=1)
-    used = innovations.p_inlier[keep] >= USED
-    return Compared(
-        taken_s[keep][good], innovations.landmark_id[keep][good], used[good], range_m[good], off[good], point[good]
-    )
+    named, used = innovations.landmark_id[keep[good]], innovations.p_inlier[keep[good]] >= USED
+    return Compared(detection[good], taken_s[keep[good]], named, used, range_m[good], off[good], point[good])
 
 
 def _find_delays_s(recording: AnyRecording, result: SlamResult) -> FloatArray:
@@ -159,7 +159,7 @@ def _rows_of(places: Landmarks, landmark_id: IntArray) -> tuple[IntArray, BoolAr
     return row, np.asarray(places.landmark_id[row] == landmark_id)
 
 
-def _poses_at(path: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, BoolArray]:
+def find_poses_at(path: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the poses at stamps (K,), in the plane the nearest ones, and whether the nearest are near enough."""
     if not len(path):
         return np.zeros((len(stamp_s), path.pose_world_robot.shape[1])), np.zeros(len(stamp_s), dtype=np.bool_)
@@ -397,7 +397,7 @@ def _count_unexplained(result: SlamResult) -> int:
     """Return landmarks of which many detections in a row were not used, where the robot was located, without a change
     of them that is reported.
     """
-    located = _poses_at(result.trajectory, result.innovations.stamp_s)[1]
+    located = find_poses_at(result.trajectory, result.innovations.stamp_s)[1]
     innovations = result.innovations[np.flatnonzero(located)]
     name, row, count = np.unique(innovations.landmark_id, return_inverse=True, return_counts=True)
     order = np.lexsort((innovations.stamp_s, row))
@@ -426,7 +426,7 @@ def _over_odometry(compared: Compared, result: SlamResult) -> float:
     name, row, count = np.unique(compared.landmark_id[fine], return_inverse=True, return_counts=True)
     scatter = []
     for each in (path, other):
-        pose = _poses_at(each, taken_s)[0]
+        pose = find_poses_at(each, taken_s)[0]
         at = (se2 if pose.shape[1] == 3 else se3).transform(pose, point_m)
         middle = medians(at, row, len(name))[0][row]
         off = np.where(count[row] >= PER_LANDMARK, np.linalg.norm(at - middle, axis=1), nan)

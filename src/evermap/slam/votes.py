@@ -69,6 +69,22 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> 
     return replace(recording, detections=replace(given, landmark_id=landmark_id), warnings=tuple(warnings))
 
 
+def list_doubled_ids(as_read: AnyRecording, recording: AnyRecording) -> IntArray:
+    """Return ids that a recording has not any more, and that were read twice in one frame, time and again.
+
+    Args:
+        as_read: the recording with all ids.
+        recording: the same `without_contradicted_ids`.
+    """
+    seen = as_read.detections
+    lost = np.setdiff1d(seen.landmark_id, np.append(recording.detections.landmark_id, UNKNOWN))
+    if not len(lost):
+        return lost
+    read, times = np.unique(np.column_stack([seen.landmark_id, seen.frame]), axis=0, return_counts=True)
+    name, count = np.unique(read[times > 1, 0], return_counts=True)
+    return np.intersect1d(name[count >= VotesConfig().fewest_doubles], lost)
+
+
 class Read(NamedTuple):
     """M detections with an id, in the order of time.
 

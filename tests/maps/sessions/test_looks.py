@@ -7,6 +7,7 @@ import pytest
 
 from evermap.config import LooksConfig
 from evermap.maps.sessions.looks import Watch, weigh_misses
+from evermap.maps.sessions.spatial import find_looks
 from evermap.sensing.visibility import LooksAt
 from evermap.types import BoolArray, FloatArray
 
@@ -96,3 +97,42 @@ def test_beyond_the_usual_range_a_miss_says_nothing() -> None:
     found, p_missed = weigh_misses(watched([eye], places, seen), places, ~seen, np.ones(3, dtype=np.bool_))
     assert not found.any()
     np.testing.assert_array_equal(p_missed, 1.0)
+
+
+def look_at(frames: int, hertz: float, *, in_turns: bool, seed: int) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Stamps (F,) with jitter, in which frames two cameras look (F, 2), and in which they see something: for spells."""
+    rng = np.random.default_rng(seed)
+    stamp_s = 100.0 + np.arange(frames) / hertz + rng.uniform(-0.002, 0.002, frames)
+    looks = np.ones((frames, 2), dtype=np.bool_)
+    if in_turns:
+        looks[:, 0], looks[:, 1] = np.arange(frames) % 2 == 0, np.arange(frames) % 2 == 1
+    spell = np.arange(frames) // 20
+    sees = np.column_stack([spell % 2 == 0, spell % 3 == 0])
+    return stamp_s, looks, looks & sees
+
+
+@pytest.mark.parametrize("in_turns", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_two_cameras_look_at_their_beat_also_where_they_see_nothing(in_turns: bool, seed: int) -> None:
+    stamp_s, looks, seen = look_at(400, 10.0, in_turns=in_turns, seed=seed)
+    assert not seen[looks].all()
+    np.testing.assert_array_equal(find_looks(stamp_s, seen, RULES), looks)
+
+
+def test_where_a_camera_has_seen_nothing_for_long_it_is_not_known_when_it_looks() -> None:
+    stamp_s, looks, seen = look_at(400, 10.0, in_turns=True, seed=0)
+    seen[120:320, 1] = False
+    found = find_looks(stamp_s, seen, RULES)
+    assert not (found & ~looks).any()
+    np.testing.assert_array_equal(found[:, 0], looks[:, 0])
+    last, first = (int(np.flatnonzero(rows)[k]) for rows, k in ((seen[:120, 1], -1), (seen[:, 1], 0)))
+    assert first < last
+    assert found[last : last + 2 * 30 + 1, 1].sum() == 31
+    assert not found[last + 62 : 318 - 60, 1].any()
+
+
+def test_a_few_views_tell_no_beat() -> None:
+    stamp_s, _, seen = look_at(400, 10.0, in_turns=True, seed=0)
+    seen[40:, 1] = False
+    assert seen[:, 1].sum() <= 20
+    np.testing.assert_array_equal(find_looks(stamp_s, seen, RULES)[:, 1], seen[:, 1])

@@ -74,7 +74,10 @@ def all_labellings(count: int, groups: int) -> np.ndarray:
 
 
 def gains_of_all(labels: np.ndarray, comparison: Comparison, prior: ChangesConfig) -> np.ndarray:
-    """(H,) closed-form gains of labellings in one window, without turns, all at once."""
+    """(H,) closed-form gains of labellings in one window, without turns, all at once.
+
+    A group goes far where its displacement is more probable so, by the prior in which it is not.
+    """
     count, groups = labels.shape[1], int(labels.max())
     a = comparison.precision.reshape(count, 2, count, 2)
     b = comparison.pull.reshape(count, 2)
@@ -82,8 +85,15 @@ def gains_of_all(labels: np.ndarray, comparison: Comparison, prior: ChangesConfi
     inner = np.einsum("hlg,lamc->hgamc", chosen, a, optimize=True)
     inner = np.einsum("hgamc,hmk->hgakc", inner, chosen, optimize=True).reshape(len(labels), 2 * groups, 2 * groups)
     right = np.einsum("hlg,la->hga", chosen, b).reshape(len(labels), -1)
-    held = inner + np.eye(2 * groups) / prior.move_sigma_m**2
-    solved = np.linalg.solve(held, right[:, :, None])[:, :, 0]
-    gain = 0.5 * (right * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(prior.move_sigma_m**2 * held)[1]
+    scale = np.full((len(labels), groups), prior.move_sigma_m)
+    for _ in range(groups + 1):
+        held = inner + np.eye(2 * groups) * np.repeat(scale, 2, axis=1)[:, :, None] ** -2
+        solved = np.linalg.solve(held, right[:, :, None])[:, :, 0]
+        squared = (solved.reshape(*scale.shape, 2) ** 2).sum(axis=2) / scale**2
+        near = scale == prior.move_sigma_m
+        far = near & (0.5 * squared * (1.0 - prior.far**-2) > 2.0 * log(prior.far) - log(prior.p_far))
+        scale = np.where(far, prior.far * scale, scale)
+    gain = 0.5 * (right * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(held)[1] - 2.0 * np.log(scale).sum(axis=1)
     table = np.array([0.0] + [log_group_prior(prior, count, n) for n in range(1, count + 1)])
-    return gain + table[chosen.sum(axis=1).astype(int)].sum(axis=1)
+    price = np.count_nonzero(scale > prior.move_sigma_m, axis=1) * log(prior.p_far)
+    return gain + price + table[chosen.sum(axis=1).astype(int)].sum(axis=1)

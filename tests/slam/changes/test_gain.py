@@ -22,7 +22,15 @@ from evermap.estimate.sparse.system import exhausted
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.gain import PLANE, Tables, hypothesis_gain, log_onset, log_prior, turning_columns
+from evermap.slam.changes.gain import (
+    PLANE,
+    Tables,
+    hypothesis_gain,
+    log_onset,
+    log_prior,
+    spread_of,
+    turning_columns,
+)
 from evermap.slam.changes.gain import gain_of as gain_alone
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
@@ -62,7 +70,8 @@ def gain_of(
     "label", [[0] * 7, [0, 0, 1, 0, 0, 0, 0], [1, 0, 1, 0, 0, 1, 0], [0, 3, 0, 3, 0, 0, 0], [1] * 7]
 )
 @pytest.mark.parametrize("onset", [0, 2])
-def test_one_group_that_only_moves_gains_in_closed_form_what_any_do(label: list[int], onset: int) -> None:
+@pytest.mark.parametrize("pull", [1.0, 300.0])
+def test_one_group_that_only_moves_gains_in_closed_form_what_any_do(label: list[int], onset: int, pull: float) -> None:
     random = np.random.default_rng(len(label) + onset)
     count, windows, columns = 7, 3, PLANE + len(turning_columns(PLANE))
     root = random.normal(size=(columns * windows * count, columns * windows * count))
@@ -75,6 +84,7 @@ def test_one_group_that_only_moves_gains_in_closed_form_what_any_do(label: list[
         log_prior(PRIOR, 9, count),
         log_onset(windows),
     )
+    tables = tables._replace(linear=pull * tables.linear)
     for other in (label, [2 if i == 6 and g == 0 else g for i, g in enumerate(label)]):  # two groups: as any
         of = np.array(other), np.array([0, onset, 1, onset]), np.zeros(4, dtype=np.bool_)
         assert gain_alone(*of, tables) == pytest.approx(hypothesis_gain(*of, tables)[0], rel=1e-10, abs=1e-10)
@@ -111,6 +121,45 @@ def test_gain_is_the_difference_of_log_marginal_likelihoods(n_windows: int, labe
             columns = membership(evidence, np.flatnonzero(np.array(label) == g), onset[g - 1])
             mean = PRIOR.move_sigma_m**2 * columns.T @ np.linalg.solve(moved, e)
             np.testing.assert_allclose(motion[g - 1, :2], mean, atol=1e-9)
+
+
+def test_two_that_are_far_apart_are_hardly_a_body_that_turned() -> None:
+    rng = np.random.default_rng(1)
+    position = rng.uniform(-5.0, 5.0, (6, 2))
+    evidence, comparison = static_evidence(position), comparison_of(0.02 * rng.normal(size=12), 0.02**2 * np.eye(12))
+    near, far = position.copy(), position.copy()
+    near[4], far[4] = near[1] + [0.6, 0.8], far[1] + [3.6, 4.8]
+    gains = [
+        gain_of(evidence, comparison, at, 1, [0, 1, 0, 0, 1, 0], [0], [turns])[0]
+        for at in (near, far)
+        for turns in (False, True)
+    ]
+    assert gains[0] == gains[2]
+    moment = 0.5 * 1.0**2, 0.5 * 6.0**2  # of two about their middle
+    width = [0.5 * log(1.0 + (PRIOR.turn_sigma_rad / 0.02) ** 2 * each) for each in moment]
+    apart = (gains[1] - gains[0] + width[0]) - (gains[3] - gains[2] + width[1])
+    assert apart == pytest.approx((6.0 - 1.0) / PRIOR.body_m, abs=1.5)
+
+
+@pytest.mark.parametrize("far_m", [0.5, 2.0, 3.0, 12.0])
+def test_what_went_far_is_of_a_wider_prior_where_that_is_more_probable(far_m: float) -> None:
+    rng = np.random.default_rng(3)
+    position = rng.uniform(-5.0, 5.0, (6, 2))
+    evidence, covariance = static_evidence(position), 0.02**2 * np.eye(12)
+    e = 0.02 * rng.normal(size=12)
+    e[4:6] += far_m * np.array([0.6, -0.8])
+    columns = membership(evidence, np.array([2]))
+    near, far = (
+        log_normal(e, covariance + (scale * PRIOR.move_sigma_m) ** 2 * columns @ columns.T)
+        for scale in (1.0, PRIOR.far)
+    )
+    expected = max(near, far + log(PRIOR.p_far)) - log_normal(e, covariance) + log_group_prior(PRIOR, 6, 1)
+    gain, motion = gain_of(evidence, comparison_of(e, covariance), position, 1, [0, 0, 1, 0, 0, 0], [0], [False])
+    assert gain == pytest.approx(expected, abs=1e-6)
+    np.testing.assert_allclose(motion[0, :2], e[4:6], rtol=2e-3)
+    wide = far + log(PRIOR.p_far) > near
+    assert wide == (far_m > 2.6)
+    np.testing.assert_array_equal(spread_of(motion[0], PRIOR), PRIOR.spread * [*2 * [PRIOR.far if wide else 1.0], 1.0])
 
 
 def linear_world(seed: int, n_windows: int) -> tuple[WindowEvidence, GivenMap]:

@@ -11,9 +11,9 @@ from references import static_evidence
 from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.slam.changes.evidence import WindowEvidence, compare
-from evermap.slam.changes.explain import GivenMap
+from evermap.slam.changes.explain import GivenMap, MovedGroup
 from evermap.slam.changes.search import find_changes
-from evermap.slam.changes.weigh import weigh, without_transients
+from evermap.slam.changes.weigh import SeenWithin, weigh, without_transients
 
 PRIOR = ChangesConfig()
 COUNT, WINDOWS = 6, 4
@@ -43,7 +43,7 @@ def dropped(evidence: WindowEvidence, given: GivenMap) -> set[tuple[int, int]]:
         found = yield from find_changes(soft, comparison, given.mean, WINDOWS, PRIOR, start=start)
         return comparison, found
 
-    kept = exhausted(without_transients(evidence, given.mean, PRIOR, search))
+    kept = exhausted(without_transients(evidence, given.mean, given.given, PRIOR, search))
     left = set(zip(kept.landmark.tolist(), kept.window.tolist(), strict=True))
     return set(zip(evidence.landmark.tolist(), evidence.window.tolist(), strict=True)) - left
 
@@ -88,3 +88,56 @@ def test_a_transient_beside_a_lasting_move(seed: int) -> None:
     assert dropped(evidence, given) == {(3, 2)}
     verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
     assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([0, 4], 1)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("seen", "is_mapped"), [(3, True), (3, False), (0, False)])
+def test_what_is_seen_elsewhere_in_the_last_window_or_in_the_first_has_moved(
+    seed: int, seen: int, is_mapped: bool
+) -> None:
+    """It is not known to have been there before and after, which is what a temporary displacement is."""
+    shift = none()
+    shift[seen, 2] = [0.5, 0.3]
+    evidence, given = evidence_with(shift, seed)
+    given = given if is_mapped else GivenMap.empty(COUNT)
+    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
+    assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([2], 3 if seen else 1)]
+    np.testing.assert_allclose(verdict.groups[0].motion[:2], [0.5, 0.3] if seen else [-0.5, -0.3], atol=0.08)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_that_exchange_their_places_across_the_room_have_moved(seed: int) -> None:
+    """Neither turned about what nobody saw again, nor are sightings of the one in the last window errors."""
+    shift, apart = none(), np.array([8.0, -6.0])
+    shift[1:, 1], shift[3, 4] = apart, -apart
+    evidence = evidence_with(shift, seed)[0]
+    evidence = evidence.without((evidence.landmark == 4) & (evidence.window == 2))
+    verdict = exhausted(weigh(evidence, GivenMap.empty(COUNT), PRIOR, WINDOWS))
+    told = {tuple(group.members.tolist()): group for group in verdict.groups}
+    assert told.keys() == {(1,), (4,)}
+    np.testing.assert_allclose(told[(1,)].motion, [*apart, 0.0], atol=0.1)
+    np.testing.assert_allclose(told[(4,)].motion, [*-apart, 0.0], atol=0.1)
+    assert verdict.probability > 0.9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_three_that_moved_apart_at_one_time_are_no_body(seed: int) -> None:
+    shift = none()
+    shift[2:, [1, 2, 4]] = [[0.9, 0.1], [-0.5, 0.7], [0.1, -0.9]]
+    evidence, given = evidence_with(shift, seed)
+    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
+    told = [(group.members.tolist(), group.window, group.turns) for group in verdict.groups]
+    assert told == [([row], 2, False) for row in (1, 2, 4)]
+
+
+def test_a_member_of_which_nothing_shows_takes_no_part_in_the_motion() -> None:
+    """Two turn by a right angle about their middle; the second is not seen since: the first went by its own way."""
+    evidence, given = evidence_with(none(), 0)
+    position = np.zeros((COUNT, 2))
+    position[[1, 3]] = [[0.0, 0.0], [2.0, 0.0]]
+    seen = SeenWithin.of(evidence, given, position)
+    whole = MovedGroup(np.array([1, 3]), True, np.array([0.5, 0.0, np.pi / 2]), 2)
+    alone = seen.find_motion(whole, np.array([True, False]))
+    assert (alone.members.tolist(), alone.turns) == ([1], False)
+    np.testing.assert_allclose(alone.motion, [0.5 + 1.0, -1.0, 0.0], atol=1e-12)
+    assert seen.find_motion(whole, np.array([True, True])).motion is whole.motion

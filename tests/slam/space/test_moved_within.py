@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 from evermap import run_slam
+from evermap.config import Config
+from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.space import moved_within
 from evermap.slam.space.against_map import MapComparison
-from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map
+from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, has_moved
+from evermap.slam.space.intake import prepare_space
+from evermap.slam.space.solve import solve_space
 from evermap.types import ChangeKind, Frames, SlamResult, SpatialRecording
 
 from .corridors import Move, World, as_poses, tagged_corridor
@@ -144,3 +149,34 @@ def test_a_map_of_which_most_is_elsewhere_is_in_doubt_not_its_landmarks(n_off: i
     unused: Any = None
     assert _contradicts_map(SpatialExplanation(unused, np.arange(10), (), found)) is is_in_doubt
     assert not _contradicts_map(SpatialExplanation(unused, np.arange(10), (), None))
+
+
+def test_others_are_asked_where_none_of_the_likeliest_is_at_two_places(monkeypatch):
+    """What moved bends the poses beside it, so that tags that stand there have the outliers."""
+    asked = []
+
+    def find(_optimum, suspects, _interval):
+        asked.append(suspects.tolist())
+        return suspects if 6 in suspects else None
+
+    monkeypatch.setattr(moved_within, "_find_among", find)
+    found = moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8, 6, 3, 5]), 0.95)
+    assert asked == [[4, 1, 0, 2], [8, 6, 3, 5]]
+    assert found.tolist() == asked[1]
+    assert moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8]), 0.95) is None
+
+
+def test_what_is_at_one_place_in_the_end_did_not_move():
+    world = tagged_corridor(3)
+    optimum = solve_space(prepare_space(world.recording, Config().slam.space), None).optimum
+    place = optimum.estimate.place.copy()
+    both = replace(optimum, estimate=replace(optimum.estimate, place=place))
+    move = moved_within.MovedWithin(2, 3, 1.0, (0.0, 2.0), 1.0)
+    assert has_moved(both, move)
+    place[3] = place[2]
+    place[3, 0] += 0.001
+    assert not has_moved(both, move)
+    place[3, 0] += 0.1
+    assert has_moved(both, move)
+    place[3] = se3.compose(place[2], se3.from_angles([0.0, 0.0, 0.2]))
+    assert has_moved(both, move)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap.config import Config, LivingConfig, LocalizeConfig
+from evermap.config import Config, LivingConfig, LocalizeConfig, LooksConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.living import EXISTS, Dated, LivingMap
@@ -251,6 +251,10 @@ class SpatialVisit:
         views = np.unique(view)
         if n_sensors == 1 and problem.driven:  # it looked in every frame
             views = np.arange(len(frames.row))
+        elif problem.driven:
+            own = np.zeros((len(frames.row), n_sensors), dtype=np.bool_)
+            own.ravel()[views] = True
+            views = np.flatnonzero(find_looks(frames.stamp_s, own, config.looks))
         views = views[self._located_frames[views // n_sensors]]
         row, sensor = views // n_sensors, views % n_sensors
         eye = se3.compose(self.path[row], optimum.estimate.mount(problem)[sensor])
@@ -325,6 +329,32 @@ def solve_visits_together(visits: Sequence[SpatialVisit], rules: LocalizeConfig)
     members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
     solved = solve_space_together(members, [visit.recording.name for visit in visits], rules)
     return [replace(visit, solved=own) for visit, own in zip(visits, solved, strict=True)]
+
+
+def find_looks(stamp_s: FloatArray, seen: BoolArray, settings: LooksConfig) -> BoolArray:
+    """Return (F, S) in which frames several sensors looked, which nothing says of frames in which they saw nothing.
+
+    Sensors look at a beat: of views of one that follow each other, many have detections. A frame on its beat, counted
+    from the nearest of these, is a look of it; cameras that take turns, or are triggered together, are told apart so.
+
+    Args:
+        stamp_s: (F,) stamps of all frames, rising.
+        seen: (F, S) where a sensor has detections.
+        settings: what a beat is.
+    """
+    looks = seen.copy()
+    for sensor, own in enumerate(seen.T):
+        hit_s = stamp_s[own]
+        gap_s = np.diff(hit_s)
+        if len(gap_s) < settings.fewest_beats:
+            continue
+        beat_s = float(np.median(gap_s[gap_s < 1.5 * np.quantile(gap_s, 0.1)]))
+        before = np.clip(np.searchsorted(hit_s, stamp_s, side="right") - 1, 0, len(hit_s) - 2)
+        beats = np.minimum(np.abs(stamp_s - hit_s[before]), np.abs(stamp_s - hit_s[before + 1])) / beat_s
+        looks[:, sensor] |= (np.abs(beats - np.round(beats)) < settings.off_beat) & (
+            np.round(beats) <= settings.most_beats
+        )
+    return looks
 
 
 def _near_hits(stamp_s: FloatArray, detected: BoolArray, within_s: float) -> BoolArray:

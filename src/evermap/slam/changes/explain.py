@@ -17,6 +17,7 @@ from evermap.config import ChangesConfig
 from evermap.estimate.robust import weigh
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
+from evermap.slam.changes.gain import spread_of
 from evermap.slam.kernels import N_SENSOR, detection_residual, kernel
 from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
 from evermap.slam.smoother import Smoother
@@ -76,7 +77,7 @@ class MovedGroup:
         """Return (k, 2) the members' positions after the motion."""
         return se2.move_together(position[self.members], self.motion[:2], float(self.motion[2]))
 
-    def motion_prior(self, position: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def motion_prior(self, position: FloatArray, prior: ChangesConfig) -> tuple[FloatArray, FloatArray]:
         """Return mean (k, 2) and covariance (2 k, 2 k) of the members' displacements, linearised at the angle found."""
         own = position[self.members] - position[self.members].mean(axis=0)
         columns = np.tile(np.eye(2), (len(own), 1))
@@ -87,7 +88,7 @@ class MovedGroup:
             tangent = np.column_stack([-turned[:, 1], turned[:, 0]])
             columns = np.column_stack([columns, tangent.ravel()])
             mean = turned - own - angle * tangent
-        variance = spread[: columns.shape[1]] ** 2
+        variance = spread_of(self.motion, prior)[: columns.shape[1]] ** 2
         return mean, (columns * variance) @ columns.T
 
 
@@ -110,7 +111,7 @@ def explained(
     places: list[int] = list(range(count))
     stamp_s = problem.seen_s
     for group in groups:
-        offset, motion_covariance = group.motion_prior(mean, prior.spread)
+        offset, motion_covariance = group.motion_prior(mean, prior)
         members = group.members
         if group.since_s is None:
             rows = se2.xy_rows(members)

@@ -10,6 +10,10 @@ which is linear in few columns (in the plane four: x, y, cosine - 1, sine), so t
 products, and the gain is the one above with the columns of the tangent (Laplace). In space the columns are x, y, z and
 the nine numbers of R - I; where landmarks have orientations, the rotation vector too, by which these turn.
 
+Most displacements are as far as is stated (`move_sigma_m`), some are `far` times that. Under one normal distribution
+what was carried across the room would cost a hundred nats, and anything else is more probable than that: that it turned
+about a landmark which nobody saw again, or that its sightings are errors.
+
 Which copies of a landmark moved depends on when: item `onset * L + landmark` stands for 'this landmark, from this
 window on'. `quadratic` and `linear` hold `T'AT` and `T'b` for the columns `T` of every item.
 """
@@ -25,8 +29,8 @@ from evermap.config import ChangesConfig
 from evermap.slam.kernels import kernel
 from evermap.types import FloatArray, IntArray
 
-_TURN_STEPS = 6
-"""Gauss-Newton steps towards the angles; without a turning group one is exact."""
+_TURN_STEPS, _MORE_STEPS = 6, 2
+"""Gauss-Newton steps towards the angles, and from there under another prior; without a turning group one is exact."""
 
 
 PLANE, POINTS, PLACES = 2, 3, 6
@@ -53,6 +57,23 @@ def motion_spread(prior: ChangesConfig, numbers: int) -> FloatArray:
     return np.repeat([prior.move_sigma_m, prior.turn_sigma_rad], 3)
 
 
+def spread_of(motion: FloatArray, prior: ChangesConfig) -> FloatArray:
+    """Return the prior standard deviations (Y,) of a motion (Y,), which are wider where its displacement is far."""
+    point_dim = PLANE if len(motion) == PLANE + 1 else POINTS
+    spread = motion_spread(prior, PLANE if point_dim == PLANE else PLACES)
+    if not is_far(motion[:point_dim] / spread[:point_dim], far_prior(prior)):
+        return spread
+    return np.append(prior.far * spread[:point_dim], spread[point_dim:])
+
+
+def far_prior(prior: ChangesConfig) -> FloatArray:
+    """Return how much farther some things go, how many do, and the usual distance of two on a body that turned [m].
+
+    Any two that moved apart fit some turn but for one number, their distance. Three and more leave no doubt.
+    """
+    return np.array([prior.far, prior.p_far, prior.body_m])
+
+
 class Tables(NamedTuple):
     """Precomputed tables for gains.
 
@@ -65,6 +86,7 @@ class Tables(NamedTuple):
         log_prior: (L + 1, 2) log prior of a group by its size, for groups that only move and that turn, relative to
             'nothing moved'.
         log_onset: (W,) log prior of the window from which on a group has moved.
+        far: (3,) see `far_prior`.
     """
 
     quadratic: FloatArray
@@ -74,6 +96,7 @@ class Tables(NamedTuple):
     spread: FloatArray
     log_prior: FloatArray
     log_onset: FloatArray
+    far: FloatArray = far_prior(ChangesConfig())
 
 
 @kernel
@@ -104,24 +127,35 @@ def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables
     value = np.zeros(size)  # in units of its prior
     column, tangent, weighted = np.zeros(total), np.zeros((total, size)), np.zeros(total)
     inner, step = np.zeros((size, size)), np.zeros(size)
-    for _ in range(_TURN_STEPS if any_turns else 1):
-        _columns_of(value, scale, width, first, start, point_dim, column, tangent)
-        for a in range(size):
-            for k in range(total):
-                weighted[k] = 0.0
-                for m in range(total):
-                    weighted[k] += matrix[k, m] * tangent[m, a]
-            step[a] = -value[a]
-            for k in range(total):
-                step[a] += tangent[k, a] * right[k] - weighted[k] * column[k]
-            for c in range(size):
-                inner[c, a] = 1.0 if c == a else 0.0
+    far, is_settled, steps = np.zeros(groups + 1, dtype=np.bool_), False, _TURN_STEPS if any_turns else 1
+    while not is_settled:
+        for _ in range(steps):
+            _columns_of(value, scale, width, first, start, point_dim, column, tangent)
+            for a in range(size):
                 for k in range(total):
-                    inner[c, a] += tangent[k, c] * weighted[k]
-        _factor(inner)
-        _solve(inner, step)
-        for a in range(size):
-            value[a] += step[a]
+                    weighted[k] = 0.0
+                    for m in range(total):
+                        weighted[k] += matrix[k, m] * tangent[m, a]
+                step[a] = -value[a]
+                for k in range(total):
+                    step[a] += tangent[k, a] * right[k] - weighted[k] * column[k]
+                for c in range(size):
+                    inner[c, a] = 1.0 if c == a else 0.0
+                    for k in range(total):
+                        inner[c, a] += tangent[k, c] * weighted[k]
+            _factor(inner)
+            _solve(inner, step)
+            for a in range(size):
+                value[a] += step[a]
+        is_settled, steps = True, min(steps, _MORE_STEPS)
+        for g in range(1, groups + 1):
+            if width[g] == 0 or far[g] or not is_far(value[start[g] : start[g] + point_dim], tables.far):
+                continue
+            far[g], is_settled = True, False
+            gain += np.log(tables.far[1])
+            for a in range(start[g], start[g] + point_dim):
+                scale[a] *= tables.far[0]
+                value[a] /= tables.far[0]
     _columns_of(value, scale, width, first, start, point_dim, column, tangent)
     for k in range(total):
         pull = right[k]
@@ -134,6 +168,18 @@ def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables
         for a in range(start[g + 1] - start[g]):
             motion[g - 1, a] = value[start[g] + a] * scale[start[g] + a]
     return gain, motion
+
+
+@kernel
+def is_far(displacement: FloatArray, far: FloatArray) -> bool:
+    """Return whether a displacement (D,), in its prior's standard deviations, is more probable as one that is far.
+
+    Most are not, so that for these the prior is the one that is stated.
+    """
+    squared = 0.0
+    for a in range(len(displacement)):
+        squared += displacement[a] * displacement[a]
+    return bool(0.5 * squared * (1.0 - far[0] ** -2) > len(displacement) * np.log(far[0]) - np.log(far[1]))
 
 
 @kernel
@@ -175,6 +221,8 @@ def gain_of(label: IntArray, onset: IntArray, turns: Any, tables: Tables) -> flo
     second = np.sqrt(max(1.0 + along * yy * along - between * between, 1e-300))
     v = across * x / first
     w = (along * y - between * v) / second
+    if is_far(np.array([(v - between * w / second) / first, w / second]), tables.far):
+        return float(hypothesis_gain(label, onset, turns, tables)[0])
     prior = tables.log_prior[size, 0] + tables.log_onset[onset[group]]
     return float(prior + 0.5 * (v * v + w * w) - np.log(first) - np.log(second))
 
@@ -184,7 +232,7 @@ def _products(
     label: IntArray, onset: IntArray, turns: Any, tables: Tables
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, float]:
     """Columns of every group (0, D or D + T), the first of each, their `C'AC` and `C'b` about centroids; log prior."""
-    quadratic, linear, position, turning, _, log_prior, log_onset = tables
+    quadratic, linear, position, turning, _, log_prior, log_onset, far = tables
     count, groups, point_dim = len(label), len(onset) - 1, position.shape[1]
     columns = point_dim + len(turning)
     width, size = np.zeros(groups + 1, dtype=np.int64), np.zeros(groups + 1, dtype=np.int64)
@@ -204,6 +252,11 @@ def _products(
                 centre[g, a] /= size[g]
             width[g] = columns if turns[g] else point_dim
             prior += log_prior[size[g], 1 if turns[g] else 0] + log_onset[onset[g]]
+            if turns[g] and size[g] == 2:
+                squared = 0.0
+                for a in range(point_dim):
+                    squared += (position[members[g, 0], a] - position[members[g, 1], a]) ** 2
+                prior -= np.sqrt(squared) / far[2]
         first[g + 1] = first[g] + width[g]
     total = first[groups + 1]
     matrix, right = np.zeros((total, total)), np.zeros(total)

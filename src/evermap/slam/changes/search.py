@@ -13,6 +13,7 @@ from evermap.slam.changes.evidence import Comparison, WindowEvidence
 from evermap.slam.changes.gain import (
     PLACES,
     Tables,
+    far_prior,
     gain_of,
     hypothesis_gain,
     log_onset,
@@ -81,6 +82,7 @@ def find_changes(
         motion_spread(prior, numbers),
         log_prior(prior, len(np.unique(evidence.landmark)), count, numbers=numbers),
         log_onset(n_windows),
+        far_prior(prior),
     )
     weighed = Weighed.nothing(count, prior.most_groups)
     # by the number of members: none, one, more
@@ -320,7 +322,8 @@ def _climb(
 @kernel
 def _count_moves(count: int, groups: int, n_windows: int) -> int:
     relabels, merges = count * (groups + 1), 2 * groups * groups
-    return relabels + merges + groups + groups + groups * n_windows + groups
+    parts = count if n_windows > 1 else 0  # else what leaves a group begins one at the same time anyway
+    return relabels + merges + groups + groups + groups * n_windows + groups + parts
 
 
 @kernel
@@ -338,9 +341,11 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
     count, groups = len(label), len(onset) - 1
     if move < count * (groups + 1):
         i, g = move % count, move // count
-        if label[i] == g:
+        left = label[i]
+        if left == g:
             return False
         label[i] = g
+        turns[left] = turns[left] and may_turn[min(_size(label, left), 2)]  # who is left alone, if that shows
         return True
     move -= count * (groups + 1)
     if move < 2 * groups * groups:
@@ -380,11 +385,33 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
             return False
         onset[g] = window
         return True
-    g = move - groups * n_windows + 1
-    if _size(label, g) == 0 or not may_turn[min(_size(label, g), 2)]:
+    move -= groups * n_windows
+    if move < groups:
+        g = move + 1
+        if _size(label, g) == 0 or not may_turn[min(_size(label, g), 2)]:
+            return False
+        turns[g] = not turns[g]
+        return True
+    return _part(label, onset, turns, move - groups, may_turn)
+
+
+@kernel
+def _part(label: IntArray, onset: IntArray, turns: Any, landmark: int, may_turn: Any) -> bool:
+    """Let a landmark leave its group and move by itself, at the same time, in place; False where it is in none.
+
+    A group that was joined by mistake explains much at its time, so that neither standing still nor moving since before
+    the session is a way out of it.
+    """
+    group = label[landmark]
+    if group == 0 or _size(label, group) < 2:
         return False
-    turns[g] = not turns[g]
-    return True
+    for free in range(1, len(onset)):
+        if _size(label, free) == 0:
+            label[landmark], onset[free] = free, onset[group]
+            turns[free] = turns[group] and may_turn[1]
+            turns[group] = turns[group] and may_turn[min(_size(label, group), 2)]
+            return True
+    return False
 
 
 @kernel

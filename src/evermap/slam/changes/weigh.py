@@ -7,17 +7,17 @@ evidence together with the changes: an unexplained change makes both look bad.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from evermap.config import ChangesConfig
 from evermap.estimate.sparse.system import Slices
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, dense_ms
 from evermap.slam.changes.explain import GivenMap, MovedGroup
-from evermap.slam.changes.gain import motion_spread
+from evermap.slam.changes.gain import PLANE, POINTS, motion_spread, spread_of
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -92,7 +92,7 @@ def weigh(
         return comparison, found
 
     if n_windows > 1 and not spared:
-        evidence = yield from without_transients(evidence, position, prior, search)
+        evidence = yield from without_transients(evidence, position, given.given, prior, search)
     trials: dict[tuple[float, float], _Trial] = {}
 
     def best_of(beliefs: list[tuple[float, float]]) -> Slices[tuple[float, float]]:
@@ -119,7 +119,8 @@ def weigh(
         improved = trials[best].score > trials[factor, softness].score
         if improved:
             factor, softness = best
-    return _posterior(evidence, list(trials.values()), trials[factor, softness], _SeenWithin.of(evidence, given))
+    seen = SeenWithin.of(evidence, given, position)
+    return _posterior(evidence, list(trials.values()), trials[factor, softness], seen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,27 +145,44 @@ def _beside(values: tuple[float, ...], value: float) -> tuple[float, ...]:
     return values[max(at - 1, 0) : at] + values[at + 1 : at + 2]
 
 
-class _SeenWithin(NamedTuple):
-    """First and last window (L,) in which every landmark was seen, and whether the map holds it."""
+class SeenWithin(NamedTuple):
+    """First and last window (L,) in which every landmark was seen, whether the map holds it, where it was (L, D)."""
 
     first: IntArray
     last: IntArray
     given: BoolArray
+    position: FloatArray
 
     @classmethod
-    def of(cls, evidence: WindowEvidence, given: GivenMap) -> _SeenWithin:
+    def of(cls, evidence: WindowEvidence, given: GivenMap, position: FloatArray) -> SeenWithin:
         first = np.full(len(given.mean), np.iinfo(np.int64).max)
         last = np.full(len(given.mean), -1)
         np.minimum.at(first, evidence.landmark, evidence.window)
         np.maximum.at(last, evidence.landmark, evidence.window)
-        return cls(first, last, given.given)
+        return cls(first, last, given.given, position)
 
     def shows(self, members: IntArray, window: int) -> BoolArray:
         """Return whether each would show that it has moved from a window on: known from before, and seen since."""
         return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
+    def find_motion(self, group: MovedGroup, shown: BoolArray) -> MovedGroup:
+        """Return the members of a group of which anything can be said, with the motion of their own centroid.
 
-def _posterior(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: _SeenWithin) -> ChangePosterior:
+        A point alone has nothing to turn.
+        """
+        members, motion = group.members[shown], group.motion
+        if shown.all() or not len(members) or not group.turns:
+            return replace(group, members=members)
+        space, point_dim = (se2, PLANE) if len(motion) == PLANE + 1 else (se3, POINTS)
+        turn = np.append(np.zeros(point_dim), motion[point_dim:])
+        arm = self.position[members, :point_dim].mean(axis=0) - self.position[group.members, :point_dim].mean(axis=0)
+        motion = motion + np.append(space.transform(space.exp(turn), arm) - arm, 0.0 * motion[point_dim:])
+        if len(members) > 1 or self.position.shape[1] > point_dim:
+            return replace(group, members=members, motion=motion)
+        return replace(group, members=members, turns=False, motion=motion - turn)
+
+
+def _posterior(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: SeenWithin) -> ChangePosterior:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
@@ -195,18 +213,19 @@ def _posterior(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, see
 _Key = tuple[tuple[tuple[int, ...], bool], ...]
 
 
-def _groups(hypotheses: Hypotheses, row: int, seen: _SeenWithin) -> tuple[_Key, tuple[MovedGroup, ...]]:
+def _groups(hypotheses: Hypotheses, row: int, seen: SeenWithin) -> tuple[_Key, tuple[MovedGroup, ...]]:
     """Return a key of a hypothesis that ignores windows and kinds of motion, and its groups."""
     label = hypotheses.label[row]
     groups = []
     for g in range(1, int(label.max()) + 1):
         members, window = np.flatnonzero(label == g), int(hypotheses.onset[row, g])
-        members = members[seen.shows(members, window)]  # of the others nothing can be said
-        if len(members) == 0:
+        whole = MovedGroup(members, bool(hypotheses.turns[row, g]), hypotheses.motion[row, g - 1], window)
+        group = seen.find_motion(whole, seen.shows(members, window))
+        if len(group.members) == 0:
             continue
-        if np.all(seen.first[members] >= window):  # nobody saw them before: as well before the session
-            window = 0
-        groups.append(MovedGroup(members, bool(hypotheses.turns[row, g]), hypotheses.motion[row, g - 1], window))
+        if np.all(seen.first[group.members] >= window):  # nobody saw them before: as well before the session
+            group = replace(group, window=0)
+        groups.append(group)
     key = tuple((tuple(int(j) for j in group.members), group.window > 0) for group in groups)
     return key, tuple(groups)
 
@@ -216,18 +235,22 @@ Search = Callable[[WindowEvidence, Hypotheses | None], Slices[tuple[Comparison, 
 
 
 def without_transients(
-    evidence: WindowEvidence, position: FloatArray, prior: ChangesConfig, search: Search
+    evidence: WindowEvidence, position: FloatArray, given: BoolArray, prior: ChangesConfig, search: Search
 ) -> Slices[WindowEvidence]:
-    """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices."""
+    """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices.
+
+    Such a landmark was elsewhere for a while, so that it was where it is before, as a map has it (`given`, (L,)) or
+    other copies, and after it. One that was not seen again has moved.
+    """
     comparison, found = yield from search(evidence, None)
     spread = motion_spread(prior, evidence.numbers)[: evidence.numbers]
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
-        spared = np.bincount(evidence.landmark)[evidence.landmark] < 2  # their landmarks have no other
-        alone = np.where(spared, 0.0, _gains(comparison, spread))
+        spared = ~_is_between(evidence, given)
+        alone = np.where(spared, 0.0, _gains(comparison, spread, prior))
         after = _explained_away(evidence, comparison, found, position, prior)
         yield dense_ms(len(comparison.pull))
-        still = np.where(spared, 0.0, _gains(after, spread))
+        still = np.where(spared, 0.0, _gains(after, spread, prior))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
         worst = int(np.argmax(still))
         if still[worst] > prior.displaced_log_odds:
@@ -244,8 +267,22 @@ def without_transients(
     return evidence
 
 
-def _gains(comparison: Comparison, spread: FloatArray) -> FloatArray:
-    """(R,) what every copy gains by a displacement of its own, of standard deviations (n,) [nats]."""
+def _is_between(evidence: WindowEvidence, given: BoolArray) -> BoolArray:
+    """Return (R,) whether the landmark of a copy is known from before it, and was seen in a later window."""
+    first = np.where(given, -1, len(evidence.window))
+    last = np.full(len(given), -1)
+    np.minimum.at(first, evidence.landmark, evidence.window)
+    np.maximum.at(last, evidence.landmark, evidence.window)
+    return (first[evidence.landmark] < evidence.window) & (evidence.window < last[evidence.landmark])
+
+
+def _gains(comparison: Comparison, spread: FloatArray, prior: ChangesConfig) -> FloatArray:
+    """(R,) what every copy gains by a displacement of its own [nats], as far as `spread` (n,), or far."""
+    far = _gains_within(comparison, prior.far * spread) + np.log(prior.p_far)
+    return np.asarray(np.maximum(_gains_within(comparison, spread), far))
+
+
+def _gains_within(comparison: Comparison, spread: FloatArray) -> FloatArray:
     n = len(spread)
     count = len(comparison.pull) // n
     rows = np.arange(count)
@@ -272,7 +309,8 @@ def _explained_away(
         tangent = np.column_stack([-turned[:, 1], turned[:, 0]])
         shift += moved[:, None] * (turned - arm - angle * tangent)
         parts = [np.tile([1.0, 0.0], (len(moved), 1)), np.tile([0.0, 1.0], (len(moved), 1)), tangent]
-        for column, sigma in zip(parts[: 3 if found.turns[0, g] else 2], prior.spread, strict=False):
+        spread = spread_of(found.motion[0, g - 1], prior)
+        for column, sigma in zip(parts[: 3 if found.turns[0, g] else 2], spread, strict=False):
             columns.append((sigma * moved[:, None] * column).ravel())
     if not columns:
         return comparison

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import ChangesConfig
+from evermap.geometry import se3
 from evermap.slam.correlation import Lasting
 from evermap.slam.space.against_map import MapComparison, MovedTogether, compared, log_map_density
 from evermap.slam.space.estimate import SpatialOptimum, converged
@@ -88,7 +89,26 @@ def explain_places(
                 probability = 1.0 / (1.0 + math.exp(-min(nats, two.nats)))
                 trial = replace(trial, moves=(*found.moves, move._replace(probability=probability)))
             found, begun, identity = trial, two.optimum, larger
-    return found
+    stood = [move for move in found.moves if not has_moved(found.optimum, move)]
+    if not stood:
+        return found
+    moves = tuple(move for move in found.moves if move not in stood)
+    return _explain_with(found.optimum, found.identity, moves, whole, stated, changes, of_bodies)
+
+
+def has_moved(optimum: SpatialOptimum, move: MovedWithin) -> bool:
+    """Return whether the two places of a landmark are still two, with all that was found after it.
+
+    What moved first bends the poses beside it, until all of it is found: what stands there seems to have moved, too.
+    """
+    problem, both = optimum.smoother.problem, np.array([move.before, move.after])
+    before, after = optimum.estimate.place[both[:, None]]
+    off = (after - before)[0, :3]
+    if problem.oriented[move.after]:
+        off = se3.local(problem.symmetries[both[:1]].nearest(before, after), after)[0]
+    dim = len(off)
+    spread = optimum.smoother.spread(optimum.now).of(len(problem.stamp_s) + both, dim).sum(axis=0)
+    return bool(0.5 * off @ np.linalg.solve(spread, off) > dim + problem.settings.repair.gain_nats)
 
 
 def _explain_with(

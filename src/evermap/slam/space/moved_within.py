@@ -28,8 +28,8 @@ from evermap.slam.space.repair import losses_at, repaired
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
-MOST_SUSPECTS = 4
-"""Landmarks that are left out in turn."""
+MOST_SUSPECTS, MOST_TURNS = 4, 2
+"""Landmarks that are left out together, and times that others are, at most."""
 ROUNDS = 4
 """Moves that are found, at most."""
 STEPS = 10
@@ -98,6 +98,8 @@ def superseded(moves: tuple[MovedWithin, ...], count: int) -> BoolArray:
 def list_movers(optimum: SpatialOptimum, identity: IntArray, asked: BoolArray, off_map: IntArray) -> IntArray:
     """Return rows of landmarks that may have moved within the session, the likeliest first; none without a symptom.
 
+    What moved bends the poses beside it, so that others have the outliers: it need not be among the first.
+
     Args:
         optimum: the solution without a further move.
         identity: (P,) rows of landmarks that its places are of.
@@ -117,7 +119,7 @@ def list_movers(optimum: SpatialOptimum, identity: IntArray, asked: BoolArray, o
     beside = np.bincount(of[bent[problem.pose_row] & good], minlength=len(asked))
     may = asked & (np.bincount(of, minlength=len(asked)) >= 2 * settings.fewest) & (own + beside > 0)
     order = np.lexsort((-beside, -own))
-    return order[may[order]][:MOST_SUSPECTS]
+    return order[may[order]][: MOST_TURNS * MOST_SUSPECTS]
 
 
 def _is_parted(optimum: SpatialOptimum, row: int) -> bool:
@@ -163,9 +165,14 @@ def find_two_places(optimum: SpatialOptimum, suspects: IntArray, interval: float
 
     Args:
         optimum: before landmarks were split.
-        suspects: rows of places.
+        suspects: rows of places, the likeliest first: the next few are asked where none of those before them is.
         interval: probability of the interval in which the change is reported.
     """
+    turns = (suspects[first : first + MOST_SUSPECTS] for first in range(0, len(suspects), MOST_SUSPECTS))
+    return next((two for some in turns if (two := _find_among(optimum, some, interval)) is not None), None)
+
+
+def _find_among(optimum: SpatialOptimum, suspects: IntArray, interval: float) -> TwoPlaces | None:
     free = _without(optimum, suspects)
     at = as_seen(optimum.smoother.problem, free, optimum.smoother.problem.measured)
     found = [two for row in suspects.tolist() if (two := _at_two_places(optimum, free, at, row, interval)) is not None]
