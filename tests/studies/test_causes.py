@@ -19,7 +19,16 @@ from evermap_studies.causes import mistakes, study
 from evermap_studies.causes.answers import ANSWERS
 from evermap_studies.causes.catalogue import World, catalogue
 from evermap_studies.causes.drives import MAKES, NEXT, Drive, Reading, as_recording, simulate
-from evermap_studies.causes.judge import compare_changes, conclude, errors, make_case, solve, true_changes
+from evermap_studies.causes.judge import (
+    compare_changes,
+    conclude,
+    errors,
+    find_answer,
+    judge,
+    make_case,
+    solve,
+    true_changes,
+)
 from evermap_studies.rows import ROWS
 
 pytestmark = pytest.mark.slow
@@ -244,6 +253,18 @@ def test_a_run_is_right_or_wrong_or_wrong_in_silence() -> None:
     assert of(sound, named_by="", bound_m=None) == (True, False)
     assert of(sound, named_by="", bound_m=None, exit=3, verdict="lost") == (False, False)
     assert of(sound, named_by="", bound_m=None, nees=5.0) == (False, True)
+
+
+def test_of_two_causes_both_are_true_and_both_have_to_be_named() -> None:
+    world = by_name("corners in a map: late, and one moved before")
+    answer = find_answer(world)
+    assert answer.codes == ANSWERS["delay"].codes
+    assert answer.verdicts == ANSWERS["change"].verdicts | ANSWERS["delay"].verdicts
+    row = judge(make_case(world, 0), None)
+    assert (row["named_by"], row["false_causes"], row["right"]) == ("change", 0, True)
+    assert judge(make_case(replace(world, also="mount"), 0), None)["named_by"] == ""
+    one = by_name("laser in a map: map mirrored")
+    assert find_answer(one) is ANSWERS[one.cause]
 
 
 def test_what_is_stated_changes_what_is_given_and_not_what_was_read() -> None:

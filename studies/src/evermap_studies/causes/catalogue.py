@@ -33,6 +33,7 @@ class World:
         make: the robot.
         in_map: whether it has a map.
         cause: key of `answers.ANSWERS`.
+        also: that of a second cause, which has to be named, too; '' where there is one.
         mistake: what is wrong; without moves the drive before it is the oracle's.
         events: landmarks that move.
         seeds: how many.
@@ -54,6 +55,7 @@ class World:
     within: float = 0.05
     bound_m: float | None = None
     quick: bool = False
+    also: str = ""
 
 
 @dataclass(slots=True)
@@ -563,7 +565,14 @@ def _attacks() -> list[World]:
     """What is harsher: two causes at once, and what nobody thought of."""
     some = _List("attacks")
     add = some.add
-    add("corners", "late and of another size", "delay", wrong.both(wrong.late(0.15), wrong.sized(1.1)), seeds=3)
+    add(
+        "corners",
+        "late and of another size",
+        "delay",
+        wrong.both(wrong.late(0.15), wrong.sized(1.1)),
+        seeds=3,
+        also="tag size",
+    )
     add(
         "corners laser",
         "late, and one moved before",
@@ -572,6 +581,7 @@ def _attacks() -> list[World]:
         wrong.moves(1),
         maps=MAP,
         seeds=3,
+        also="delay",
     )
     add(
         "corners",
@@ -581,6 +591,7 @@ def _attacks() -> list[World]:
         wrong.exchanges(),
         maps=MAP,
         seeds=3,
+        also="tag size",
     )
     add(
         "laser",
@@ -620,6 +631,7 @@ def _attacks() -> list[World]:
         wrong.both(wrong.odometer(turn=-1.0), wrong.map_mirrored(1)),
         maps=MAP,
         seeds=3,
+        also="map mirror",
     )
     add(
         "laser",

@@ -153,7 +153,7 @@ def _rounded(value: float | None) -> float | None:
 
 def judge(case: Case, oracle: Row | None) -> Row:
     """Run a case and return everything that is scored; `oracle` are the errors of the oracle's run, if it had one."""
-    world, answer = case.world, ANSWERS[case.world.cause]
+    world, answer = case.world, find_answer(case.world)
     solved = solve(case.given)
     result = solved.result
     verdict = None if result is None or result.verdict is None else result.verdict.kind
@@ -179,11 +179,22 @@ def judge(case: Case, oracle: Row | None) -> Row:
         "oracle_key": case.oracle_key, "oracle_m": None if oracle is None else oracle["error_m"],
         "cpu_s": round(solved.cpu_s, 2),
     }  # fmt: skip
-    row["named_by"] = named_by(world, answer, solved, missed, truth)
+    row["named_by"] = named_by(world, ANSWERS[world.cause], solved, missed, truth)
+    if world.also and not named_by(world, ANSWERS[world.also], solved, missed, truth):
+        row["named_by"] = ""
     row["value_off"] = value_off(world, result)
     row["false_causes"] = _false_causes(answer, solved)
     row["bound_m"] = bound(world, row["oracle_m"])
     return {**row, **conclude(world, answer, row)}
+
+
+def find_answer(world: World) -> Answer:
+    """Return what is right of a world: of one with two causes, both are true, and either verdict."""
+    answer = ANSWERS[world.cause]
+    if not world.also:
+        return answer
+    other = ANSWERS[world.also]
+    return replace(answer, verdicts=answer.verdicts | other.verdicts, codes=answer.codes | other.codes)
 
 
 def bound(world: World, oracle_m: float | None) -> float | None:
