@@ -51,6 +51,7 @@ def run_slam(
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
+    from evermap.slam.mistakes import NO_ODOMETRY
     from evermap.slam.moving_bodies import without_motion
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.up import with_known_up
@@ -75,6 +76,8 @@ def run_slam(
     if not is_in_space(recording):
         recording, moved = without_motion(recording, config)
         remarks = (*remarks, *moved)
+        if any(finding.code == NO_ODOMETRY for finding in found):  # all landmarks move: to ask which says nothing
+            config = _without_changes(config)
     given = Inputs.of(recording, prior_map)
 
     def conclude(**more: Any) -> SlamResult:
@@ -90,6 +93,12 @@ def run_slam(
     if result.causes or realtime or not config.slam.explain.on or not _is_held(result):
         return result
     return conclude(is_suspected=True)  # its scores cost too much to be asked before all else is sound
+
+
+def _without_changes(config: Config) -> Config:
+    """Return settings by which no landmark moves, and no cause is asked."""
+    explain = config.slam.explain.model_copy(update={"on": False})
+    return config.model_copy(update={"slam": config.slam.model_copy(update={"method": "nohyp", "explain": explain})})
 
 
 def _is_held(result: SlamResult) -> bool:

@@ -101,6 +101,19 @@ def test_an_odometry_is_right_that_says_that_a_parked_robot_stands(make: Any) ->
     assert not len(find_silences(replace(recording, detections=seen), USUAL))
 
 
+def test_where_the_odometry_never_moves_it_is_not_asked_what_moved() -> None:
+    """Everything did: the search took minutes, and its answers were false."""
+    given = in_plane()
+    odometry = given.odometry
+    still = {name: 0.0 * getattr(odometry, name) for name in ("forward_mps", "lateral_mps", "angular_radps")}
+    result = run_slam(replace(given, odometry=replace(odometry, **still)))
+    assert not result.changes
+    assert not result.causes
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    assert "the odometry is zero throughout" in result.verdict.message
+
+
 def test_rows_within_silences_are_left_out_and_no_others() -> None:
     recording = standing(in_plane())
     kept = without_silences(recording, find_silences(recording, USUAL)).odometry

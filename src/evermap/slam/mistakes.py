@@ -305,6 +305,8 @@ LEAST_STEP_S = 0.4
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
 
 
+NO_ODOMETRY = "no-odometry"
+"""Code of the finding that the odometry never moves, although the robot drove."""
 STANDS, MOVED = 1e-3, 0.1
 """Speed up to which the odometry says so [m/s, rad/s], and difference of two sightings from which the robot moved."""
 RIDES, NEARLY = 0.2, 0.9
@@ -827,7 +829,7 @@ def find_motion(recording: AnyRecording, settings: CheckConfig) -> list[Finding]
             f"the odometry is zero throughout, but {np.mean(moved):.0%} of the landmarks seen again within seconds "
             f"have moved in the sensor's view: the robot drove ({pairs.speeds})"
         )
-        return [Finding("no-odometry", message, usable=False)]
+        return [Finding(NO_ODOMETRY, message, usable=False)]
     undone = HONEST
     found: list[Finding] = []
     for _ in range(3):
