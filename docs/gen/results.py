@@ -45,6 +45,7 @@ STUDIES = (
     "space",
     "building",
     "robots",
+    "causes",
     "persistence-speed",
     "soak",
     "scale",
