@@ -21,7 +21,7 @@ from evermap.io.map_formats import MAP_FORMATS, SurveyFile, correct_map, read_la
 from evermap.pipeline import run_slam
 from evermap.runs.audit import run as audit_module
 from evermap.runs.audit.drives import in_order
-from evermap.runs.audit.entries import join_drives
+from evermap.runs.audit.entries import join_drives, with_exchanges
 from evermap.runs.audit.report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
 from evermap.runs.audit.result import Audit, AuditEntry, EntryState
 from evermap.runs.audit.run import audit_map
@@ -165,6 +165,38 @@ def test_what_moved_between_two_drives_is_stale_and_what_was_wrong_before_is_wro
     assert np.isnan(by_label["3"].from_s)
     stale = by_label["7"]
     assert found.drives[0].from_s < stale.from_s <= found.drives[0].to_s < found.drives[1].from_s <= stale.to_s
+
+
+def entry_at(name: int, place: list[float], state: EntryState, p: float = 0.999, hits: int = 6) -> AuditEntry:
+    """A point that was seen at a place of the plane."""
+    at, no = np.array(place), float("nan")
+    return AuditEntry(name, str(name), state, p, at, no, no, no, no, 1.0, hits, 0, 1, at, 1e-4 * np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("p", "hits", "state", "is_exchanged"),
+    [
+        (0.999, 6, EntryState.UNDECIDED, True), (0.999, 3, EntryState.UNDECIDED, True),
+        (0.999, 2, EntryState.UNDECIDED, False), (0.8, 6, EntryState.UNDECIDED, False),
+        (0.999, 6, EntryState.RIGHT, False), (0.999, 6, EntryState.STALE, True),
+    ],
+)  # fmt: skip
+def test_one_that_few_readings_put_at_the_place_of_another_was_exchanged_with_it(
+    p: float, hits: int, state: EntryState, is_exchanged: bool
+) -> None:
+    """Where 1 should be stands 2 for certain, so that 1 is not there, whatever most readings of its number are."""
+    given = Landmarks.at(np.array([1, 2, 3]), np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 5.0]]), sigma_m=0.01)
+    few, sure = entry_at(1, [5.0, 0.0], state, p, hits), entry_at(2, [0.0, 0.0], EntryState.WRONG)
+    found = with_exchanges([few, sure, entry_at(3, [0.0, 5.0], EntryState.RIGHT, 0.001)], given)
+    wanted = [EntryState.EXCHANGED, EntryState.EXCHANGED] if is_exchanged else [state, EntryState.WRONG]
+    assert [one.state for one in found] == [*wanted, EntryState.RIGHT]
+    assert [one.like_id for one in found] == ([2, 1, -1] if is_exchanged else [-1, -1, -1])
+
+
+def test_of_two_that_are_not_decided_none_decides_the_other() -> None:
+    given = Landmarks.at(np.array([1, 2]), np.array([[0.0, 0.0], [5.0, 0.0]]), sigma_m=0.01)
+    both = [entry_at(1, [5.0, 0.0], EntryState.UNDECIDED), entry_at(2, [0.0, 0.0], EntryState.UNDECIDED)]
+    assert [one.state for one in with_exchanges(both, given)] == [EntryState.UNDECIDED] * 2
 
 
 def test_what_moved_while_the_robot_drove_is_stale_from_then_on() -> None:

@@ -212,8 +212,14 @@ def _never_seen(entry: AuditEntry, given: Landmarks, row: int, heard: Sequence[H
 
 
 def with_exchanges(entries: Sequence[AuditEntry], given: Landmarks) -> list[AuditEntry]:
-    """Return the entries, those of which each stands where the map has the next, around to the first, as exchanged."""
-    wrong = {entry.landmark_id: entry for entry in entries if entry.state in (EntryState.WRONG, EntryState.STALE)}
+    """Return the entries, those of which each stands where the map has the next, around to the first, as exchanged.
+
+    One of them is wrong for certain. Of another, few of whose readings fit its place, that decides: at the place that
+    the map has of it something else stands.
+    """
+    sure = {entry.landmark_id for entry in entries if entry.state in (EntryState.WRONG, EntryState.STALE)}
+    few = {entry.landmark_id for entry in entries if _is_elsewhere(entry)}
+    wrong = {entry.landmark_id: entry for entry in entries if entry.landmark_id in sure | few}
     at = {name: k for k, name in enumerate(given.landmark_id.tolist())}
     stands_at = {name: _whose_place(entry, [at[other] for other in wrong if other != name], given)
                  for name, entry in wrong.items()}  # fmt: skip
@@ -222,7 +228,7 @@ def with_exchanges(entries: Sequence[AuditEntry], given: Landmarks) -> list[Audi
         ring = [name]
         while (after := stands_at[ring[-1]]) not in (-1, name) and after not in ring:
             ring.append(after)
-        if stands_at[ring[-1]] == name and len(ring) > 1:
+        if stands_at[ring[-1]] == name and len(ring) > 1 and not sure.isdisjoint(ring):
             like[name] = stands_at[name]
     labels = {entry.landmark_id: entry.label for entry in entries}
     return [
@@ -236,6 +242,11 @@ def with_exchanges(entries: Sequence[AuditEntry], given: Landmarks) -> list[Audi
         else entry
         for entry in entries
     ]
+
+
+def _is_elsewhere(entry: AuditEntry) -> bool:
+    """Return whether an entry that is not decided was seen somewhere else, often enough to say where."""
+    return entry.state is EntryState.UNDECIDED and entry.probability >= DECIDED and entry.n_hits >= FEWEST
 
 
 def _whose_place(entry: AuditEntry, rows: Sequence[int], given: Landmarks) -> int:
