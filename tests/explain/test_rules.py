@@ -6,11 +6,12 @@ import math
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from evermap import run_slam
 from evermap.config import Config, SlamConfig
-from evermap.explain import competition, triggers
+from evermap.explain import competition, seeds, triggers
 from evermap.explain.answer import list_causes
 from evermap.explain.causes import Inputs, Suspect
 from evermap.explain.screens import FAR
@@ -154,3 +155,15 @@ def test_directions_that_meet_elsewhere_than_ranges_say_are_a_symptom(
     assert triggers.find_symptoms(result, inputs, Config().slam) == ()
     monkeypatch.setattr(triggers, "find_single_scales", lambda *_: {3: state, 4: 0.0})
     assert triggers.find_symptoms(result, inputs, Config().slam) == symptoms
+
+
+@pytest.mark.parametrize(("other", "is_a_size"), [(1.0, True), (1.08, True), (1.4, False)])
+def test_a_landmark_has_another_size_only_where_all_sides_say_the_same(other: float, is_a_size: bool) -> None:
+    """Seen from two sides, at half of the true distance, and at `other` times that from the second."""
+    angle = np.concatenate([np.linspace(0.0, 0.8, 8), np.linspace(2.0, 2.8, 8)])
+    eye = 4.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    range_m = np.where(np.arange(16) < 8, 2.0, 2.0 * other)
+    found = seeds._where_rays_meet(eye, -eye / 4.0, range_m)
+    assert np.isfinite(found) == is_a_size
+    if is_a_size:
+        assert found == pytest.approx(np.log(2.0) - 0.5 * np.log(other), abs=0.05)

@@ -45,6 +45,9 @@ OF_MEDIAN, TIMES_SIGMA = 1.86, 5.0
 which it is not 0."""
 FEWEST_VIEWS, PARALLAX = 6, 0.02
 """Views of a landmark, and the least share of them that are crosswise, from which directions say how far it is."""
+ALIKE, ALIKE_SHARE = 0.1, 0.15
+"""Difference of logarithms of that distance over the ranges, and share of it, within which four fifths of the views
+agree on a size."""
 MOUNT_STEPS = 8
 """Steps towards the place of a sensor."""
 MOST_PAIRS = 4000
@@ -284,7 +287,9 @@ def _rays(
 
 
 def _where_rays_meet(eye: FloatArray, along: FloatArray, range_m: FloatArray) -> float:
-    """Log of the distance to where rays meet over the ranges along them, in the median; nan where it does not show."""
+    """Log of the distance to where rays meet over the ranges along them, in the median; nan where it does not show, or
+    is another one from elsewhere: then it is no size.
+    """
     dim = eye.shape[1]
     weight = np.ones(len(eye))
     point = eye[0]
@@ -301,4 +306,6 @@ def _where_rays_meet(eye: FloatArray, along: FloatArray, range_m: FloatArray) ->
     ahead = far > 0.1 * range_m
     if np.count_nonzero(ahead) < FEWEST_VIEWS:
         return math.nan
-    return float(np.median(np.log(far[ahead] / range_m[ahead])))
+    ratio = np.log(far[ahead] / range_m[ahead])
+    usual, spread = float(np.median(ratio)), float(np.ptp(np.quantile(ratio, (0.1, 0.9))))
+    return usual if spread < max(ALIKE, ALIKE_SHARE * abs(usual)) else math.nan
