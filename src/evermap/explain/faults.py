@@ -52,9 +52,10 @@ POORLY, LEAST_M = 5.0, 0.02
 
 APART_M, SCATTERS = 0.3, 5.0
 """Distance of two landmarks of one identity, at least [m], and over what sightings of a landmark scatter by."""
-TURNS, AT_ONCE = 3, 2
+TURNS, AT_ONCE, OFTEN = 3, 2, 0.3
 """Times that an identity is seen at the one place, then at the other: what was carried off and brought back makes two.
-Or frames that show both, which a wrong reading may do once."""
+Or frames that show both, which a wrong reading may do once. And share of the sightings that are of the second: outliers
+of a real sensor lie together, too, but are fewer."""
 
 
 def find_faults(
@@ -145,7 +146,8 @@ def find_doubles(result: SlamResult, recording: AnyRecording) -> list[tuple[str,
         taken_s = np.concatenate([compared.taken_s[own], compared.taken_s[others]])
         is_second = np.repeat([False, True], [len(own), len(others)])[np.argsort(taken_s, kind="stable")]
         at_once = np.intersect1d(compared.taken_s[own], compared.taken_s[others])
-        if len(at_once) >= AT_ONCE or np.count_nonzero(np.diff(is_second)) >= TURNS:
+        is_double = len(at_once) >= AT_ONCE or np.count_nonzero(np.diff(is_second)) >= TURNS
+        if is_double and len(others) > OFTEN * len(taken_s):
             name = str(recording.landmark_names.get(identity, identity))
             found.append((name, float(np.linalg.norm(second - first))))
     return found

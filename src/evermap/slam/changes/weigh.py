@@ -239,18 +239,21 @@ def without_transients(
 ) -> Slices[WindowEvidence]:
     """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices.
 
-    Such a landmark was elsewhere for a while, so that it was where it is before, as a map has it (`given`, (L,)) or
-    other copies, and after it. One that was not seen again has moved.
+    Such a landmark was elsewhere for a while: it was where it is before, as a map has it (`given`, (L,)) or other
+    copies, and after it. Or its first sightings were, if not far off: what a drive begins with is the least certain. One
+    that was not seen again has moved.
     """
     comparison, found = yield from search(evidence, None)
     spread = motion_spread(prior, evidence.numbers)[: evidence.numbers]
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
-        spared = ~_is_between(evidence, given)
-        alone = np.where(spared, 0.0, _gains(comparison, spread, prior))
+        known = np.bincount(evidence.landmark, minlength=len(given)) + given
+        spared = ~(_is_followed(evidence) & (known[evidence.landmark] > 1))
+        is_first = ~_is_preceded(evidence, given)
+        alone = np.where(spared, 0.0, _gains(comparison, spread, prior, near=is_first))
         after = _explained_away(evidence, comparison, found, position, prior)
         yield dense_ms(len(comparison.pull))
-        still = np.where(spared, 0.0, _gains(after, spread, prior))
+        still = np.where(spared, 0.0, _gains(after, spread, prior, near=is_first))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
         worst = int(np.argmax(still))
         if still[worst] > prior.displaced_log_odds:
@@ -267,19 +270,27 @@ def without_transients(
     return evidence
 
 
-def _is_between(evidence: WindowEvidence, given: BoolArray) -> BoolArray:
-    """Return (R,) whether the landmark of a copy is known from before it, and was seen in a later window."""
-    first = np.where(given, -1, len(evidence.window))
-    last = np.full(len(given), -1)
-    np.minimum.at(first, evidence.landmark, evidence.window)
+def _is_followed(evidence: WindowEvidence) -> BoolArray:
+    """Return (R,) whether the landmark of a copy was seen in a later window."""
+    last = np.full(int(evidence.landmark.max(initial=-1)) + 1, -1)
     np.maximum.at(last, evidence.landmark, evidence.window)
-    return (first[evidence.landmark] < evidence.window) & (evidence.window < last[evidence.landmark])
+    return np.asarray(evidence.window < last[evidence.landmark])
 
 
-def _gains(comparison: Comparison, spread: FloatArray, prior: ChangesConfig) -> FloatArray:
-    """(R,) what every copy gains by a displacement of its own [nats], as far as `spread` (n,), or far."""
+def _is_preceded(evidence: WindowEvidence, given: BoolArray) -> BoolArray:
+    """Return (R,) whether the landmark of a copy is known from before it."""
+    first = np.where(given, -1, len(evidence.window))
+    np.minimum.at(first, evidence.landmark, evidence.window)
+    return np.asarray(first[evidence.landmark] < evidence.window)
+
+
+def _gains(comparison: Comparison, spread: FloatArray, prior: ChangesConfig, near: BoolArray) -> FloatArray:
+    """(R,) what every copy gains by a displacement of its own [nats], as far as `spread` (n,), or far; not those that
+    are `near` (R,).
+    """
+    usual = _gains_within(comparison, spread)
     far = _gains_within(comparison, prior.far * spread) + np.log(prior.p_far)
-    return np.asarray(np.maximum(_gains_within(comparison, spread), far))
+    return np.where(near, usual, np.maximum(usual, far))
 
 
 def _gains_within(comparison: Comparison, spread: FloatArray) -> FloatArray:
