@@ -240,8 +240,8 @@ def without_transients(
     """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices.
 
     Such a landmark was elsewhere for a while: it was where it is before, as a map has it (`given`, (L,)) or other
-    copies, and after it. Or its first sightings were, if not far off: what a drive begins with is the least certain. One
-    that was not seen again has moved.
+    copies, and after it. Or its first sightings were, if not far off: what a drive begins with is the least certain.
+    One that was not seen again has moved.
     """
     comparison, found = yield from search(evidence, None)
     spread = motion_spread(prior, evidence.numbers)[: evidence.numbers]
