@@ -43,7 +43,7 @@ def dropped(evidence: WindowEvidence, given: GivenMap) -> set[tuple[int, int]]:
         found = yield from find_changes(soft, comparison, given.mean, WINDOWS, PRIOR, start=start)
         return comparison, found
 
-    kept = exhausted(without_transients(evidence, given.mean, given.given, PRIOR, search))
+    kept = exhausted(without_transients(evidence, given.mean, given, PRIOR, search))
     left = set(zip(kept.landmark.tolist(), kept.window.tolist(), strict=True))
     return set(zip(evidence.landmark.tolist(), evidence.window.tolist(), strict=True)) - left
 

@@ -92,7 +92,7 @@ def weigh(
         return comparison, found
 
     if n_windows > 1 and not spared:
-        evidence = yield from without_transients(evidence, position, given.given, prior, search)
+        evidence = yield from without_transients(evidence, position, given, prior, search)
     trials: dict[tuple[float, float], _Trial] = {}
 
     def best_of(beliefs: list[tuple[float, float]]) -> Slices[tuple[float, float]]:
@@ -235,11 +235,11 @@ Search = Callable[[WindowEvidence, Hypotheses | None], Slices[tuple[Comparison, 
 
 
 def without_transients(
-    evidence: WindowEvidence, position: FloatArray, given: BoolArray, prior: ChangesConfig, search: Search
+    evidence: WindowEvidence, position: FloatArray, given: GivenMap, prior: ChangesConfig, search: Search
 ) -> Slices[WindowEvidence]:
     """Return the evidence without copies that are displaced alone, from mapped positions (L, 2), in slices.
 
-    Such a landmark was elsewhere for a while: it was where it is before, as a map has it (`given`, (L,)) or other
+    Such a landmark was elsewhere for a while: it was where it is before, as a map has it (`given`) or other
     copies, and after it. Or its first sightings were, if not far off: what a drive begins with is the least certain.
     One that was not seen again has moved.
     """
@@ -247,9 +247,9 @@ def without_transients(
     spread = motion_spread(prior, evidence.numbers)[: evidence.numbers]
     for _ in range(len(evidence.landmark)):
         copy = np.arange(len(evidence.landmark))
-        known = np.bincount(evidence.landmark, minlength=len(given)) + given
-        spared = ~(_is_followed(evidence) & (known[evidence.landmark] > 1))
-        is_first = ~_is_preceded(evidence, given)
+        seen = SeenWithin.of(evidence, given, position)
+        spared = evidence.window >= seen.last[evidence.landmark]  # not seen again
+        is_first = ~given.given[evidence.landmark] & (evidence.window <= seen.first[evidence.landmark])
         alone = np.where(spared, 0.0, _gains(comparison, spread, prior, near=is_first))
         after = _explained_away(evidence, comparison, found, position, prior)
         yield dense_ms(len(comparison.pull))
@@ -268,20 +268,6 @@ def without_transients(
         evidence = evidence.without(copy == best)
         comparison, found = yield from search(evidence, found)
     return evidence
-
-
-def _is_followed(evidence: WindowEvidence) -> BoolArray:
-    """Return (R,) whether the landmark of a copy was seen in a later window."""
-    last = np.full(int(evidence.landmark.max(initial=-1)) + 1, -1)
-    np.maximum.at(last, evidence.landmark, evidence.window)
-    return np.asarray(evidence.window < last[evidence.landmark])
-
-
-def _is_preceded(evidence: WindowEvidence, given: BoolArray) -> BoolArray:
-    """Return (R,) whether the landmark of a copy is known from before it."""
-    first = np.where(given, -1, len(evidence.window))
-    np.minimum.at(first, evidence.landmark, evidence.window)
-    return np.asarray(first[evidence.landmark] < evidence.window)
 
 
 def _gains(comparison: Comparison, spread: FloatArray, prior: ChangesConfig, near: BoolArray) -> FloatArray:
