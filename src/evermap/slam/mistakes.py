@@ -421,8 +421,11 @@ def off(residual: FloatArray) -> FloatArray:
 def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | None:
     """Return pairs of sightings; None if hardly any landmark is seen twice during the odometry."""
     first, second = sighting_pairs(recording, settings)
-    if len(first) < settings.fewest:
-        return None
+    return make_pairs(recording, first, second) if len(first) >= settings.fewest else None
+
+
+def make_pairs(recording: AnyRecording, first: IntArray, second: IntArray) -> Pairs:
+    """Return pairs of sightings by their rows, as `sighting_pairs` finds them."""
     return (SpatialPairs if is_in_space(recording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
 
 
@@ -718,8 +721,8 @@ def find_silences(recording: AnyRecording, settings: CheckConfig) -> FloatArray:
     first, second = sighting_pairs(recording, settings, with_bearing=not blind)
     if blind:
         moves = has_range_changed(recording, first, second)  # type: ignore[arg-type]
-    elif len(first) and (pairs := pairs_of(recording, settings)) is not None:
-        moves = off(pairs.residual(HONEST, stands=True)[0]) > MOVED
+    elif len(first) >= settings.fewest:
+        moves = off(make_pairs(recording, first, second).residual(HONEST, stands=True)[0]) > MOVED
     else:
         return np.zeros((0, 2))
     seen_s, landmark = recording.frames.stamp_s[recording.detections.frame], recording.detections.landmark_id[first]
@@ -769,10 +772,9 @@ def find_riders(recording: AnyRecording, settings: CheckConfig) -> IntArray:
     all of a rider show it where it was, while the others, seen then, have moved as the odometry says.
     """
     none = np.zeros(0, dtype=np.int64)
-    pairs = pairs_of(recording, settings)
-    if pairs is None or pairs.still:
+    first, second = sighting_pairs(recording, settings)
+    if len(first) < settings.fewest or (pairs := make_pairs(recording, first, second)).still:
         return none
-    first, _ = sighting_pairs(recording, settings)
     frame, identity = recording.detections.frame[first], recording.detections.landmark_id[first]
     in_view, against_odometry = (off(pairs.residual(HONEST, stands=stands)[0]) for stands in (True, False))
     shows = against_odometry > MOVED
