@@ -21,7 +21,7 @@ from evermap.geometry import se3
 from evermap.geometry.square import with_square_poses
 from evermap.show import Shown
 from evermap.slam.cleaning import clean
-from evermap.slam.gaps import spikes
+from evermap.slam.gaps import find_spikes
 from evermap.slam.mistakes import (
     HONEST,
     USUAL,
@@ -408,7 +408,7 @@ def _left_out_in_space(recording: SpatialRecording, settings: SlamConfig) -> lis
 def _jumps(odometry: SpatialOdometry, settings: CleaningConfig) -> list[Finding]:
     """Steps between two poses that no robot drives."""
     velocity = _velocity(odometry)
-    rows = np.flatnonzero(spikes(odometry.stamp_s[1:], velocity, settings))
+    rows = np.flatnonzero(find_spikes(odometry.stamp_s[1:], velocity, settings))
     if not len(rows):
         return []
     step = velocity[:, rows] * np.diff(odometry.stamp_s)[rows]

@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.config import CleaningConfig
 from evermap.errors import DataError
-from evermap.slam.gaps import running_median, spikes
+from evermap.slam.gaps import find_running_median, find_spikes
 from evermap.slam.mistakes import LEAST_STEP_S, clock_steps
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 from evermap.valid import LATEST_S
@@ -69,7 +69,7 @@ def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) 
     possible = np.all(np.abs(velocity) <= settings.fastest, axis=0)
     _remark(remarks, "odometry rows beyond possible velocities dropped", int(np.sum(~possible)))
     odometry, velocity = rows_of(odometry, possible), velocity[:, possible]
-    spike = spikes(odometry.stamp_s, velocity, settings)
+    spike = find_spikes(odometry.stamp_s, velocity, settings)
     _remark(remarks, "odometry rows with a spike dropped", int(np.sum(spike)))
     return rows_of(odometry, ~spike)
 
@@ -291,13 +291,15 @@ def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray,
         return stamps, np.zeros(0)
     found = np.flatnonzero(np.isfinite(stamps))
     told = stamps[found]
-    kept = np.abs(told - running_median(told, settings.around)) <= settings.stray_s
+    kept = np.abs(told - find_running_median(told, settings.around)) <= settings.stray_s
     stamps[found[~kept]] = np.nan
     found, told = found[kept], told[kept]
     forward = np.diff(told)
     forward = forward[forward > 0.0]
     # against a clock that ticks once a message, a loss is a step up, and only a clock that is set back a step down
-    ahead = running_median(told - np.arange(len(told)) * (np.median(forward) if len(forward) else 0.0), settings.around)
+    ahead = find_running_median(
+        told - np.arange(len(told)) * (np.median(forward) if len(forward) else 0.0), settings.around
+    )
     fall = np.diff(ahead, prepend=ahead[:1])
     set_back = fall < -settings.step_s
     stamps[found] = told - np.cumsum(np.where(set_back, fall, 0.0))

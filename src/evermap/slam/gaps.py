@@ -28,19 +28,19 @@ def is_outside(gaps_s: FloatArray, start_s: FloatArray, stop_s: FloatArray) -> B
     return found
 
 
-def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) -> BoolArray:
+def find_spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) -> BoolArray:
     """Return (N,) which velocities (K, N) differ from those around them by more than a robot can accelerate."""
-    if len(stamp_s) < 3:
+    if len(stamp_s) < 3 or np.ptp(velocity, axis=1).max() <= settings.sharpest:  # as of most robots
         return np.zeros(len(stamp_s), dtype=np.bool_)
     step_s = np.diff(stamp_s)
     step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
     step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
-    usual = np.stack([running_median(column, settings.around) for column in velocity])
+    usual = np.stack([find_running_median(column, settings.around) for column in velocity])
     most = np.maximum(settings.hardest * step_s, settings.sharpest)
     return np.asarray(np.any(np.abs(velocity - usual) > most, axis=0))
 
 
-def running_median(values: FloatArray, around: int) -> FloatArray:
+def find_running_median(values: FloatArray, around: int) -> FloatArray:
     """Return (N,) the median of the `around` values centred on each; ends are padded with their values."""
     if len(values) == 0:
         return values

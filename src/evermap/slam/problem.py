@@ -17,7 +17,7 @@ from evermap.estimate.sparse.system import Factorised, Slices, exhausted
 from evermap.geometry import se2, se3
 from evermap.slam.base_problem import BaseProblem
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.gaps import spikes
+from evermap.slam.gaps import find_spikes
 from evermap.slam.kernels import N_STATES, kernel
 from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.types import ANY_BEARING_RAD, BoolArray, FloatArray, IntArray, Recording
@@ -105,12 +105,12 @@ class Drive:
 
         What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
         to that of `longest_silence_s`. Stamps (n,) strictly increase; velocities are (n, 3) forward, lateral, turn, or
-        (n, 4) with what is known of the turn's jitter. A step that no robot
-        drives may be what the odometry says, or none: its standard deviation is itself.
+        (n, 4) with what is known of the turn's jitter. A step that no robot drives, as of an estimate that is corrected
+        or of a robot that is carried, may be what the odometry says, or none: its standard deviation is itself.
         """
         if velocity.shape[1] == 3:
             velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2], settings)])
-        silence, jumps = np.diff(stamp_s), find_jumps(stamp_s, velocity[:, :3])
+        silence, jumps = np.diff(stamp_s), find_spikes(stamp_s, velocity[:, :3].T, LIMITS)
         usual_s = np.minimum(silence, np.median(silence)) if len(silence) else silence
         unknown = np.where(jumps, (velocity[:, :3] ** 2).sum(axis=1) * np.append(usual_s, 0.0), 0.0)
         if len(silent := np.flatnonzero(silence > settings.silence_s)):
@@ -126,16 +126,6 @@ class Drive:
         # after the last row nothing is known either
         stamps = np.append(stamp_s, stamp_s[-1] + 0.5 * settings.silence_s)
         return cls(stamps, np.vstack([velocity, np.zeros(4)]), np.append(unknown, settings.silent_variance))
-
-
-def find_jumps(stamp_s: FloatArray, velocity: FloatArray) -> BoolArray:
-    """Return (n,) rows of velocities (n, 3) that no robot drives (`gaps.spikes`).
-
-    An estimate that is corrected jumps, and a robot that is carried is elsewhere.
-    """
-    if len(stamp_s) < 3 or np.ptp(velocity, axis=0).max() <= LIMITS.sharpest:
-        return np.zeros(len(stamp_s), dtype=np.bool_)
-    return spikes(stamp_s, velocity.T, LIMITS)
 
 
 def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray, settings: OdometryConfig = USUAL) -> FloatArray:
