@@ -86,8 +86,10 @@ def run_slam(
         if prior_map is not None:
             expected = prior_map[~np.isin(prior_map.landmark_id, doubled)]  # what was read was not missed
             result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
-        told = under.recording, config, under.prior_map, found, doubled
-        return _judge(result, *told, as_read=read, session=session.solution_of(visit))
+        return _judge(
+            result, under.recording, config, under.prior_map, found, doubled,
+            as_read=read, session=session.solution_of(visit),
+        )  # fmt: skip
 
     result = conclude(realtime=realtime, progress=progress)
     if result.causes or realtime or not config.slam.explain.on or not _is_held(result):

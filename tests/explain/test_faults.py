@@ -181,7 +181,7 @@ def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
 
 
-def renamed(recording: Any, names: dict[int, int], until_s: float = np.inf) -> Any:
+def rename(recording: Any, names: dict[int, int], until_s: float = np.inf) -> Any:
     """Landmarks with the identity of another one, until an instant."""
     seen, own = recording.detections, recording.detections.landmark_id.copy()
     early = recording.frames.stamp_s[seen.frame] < until_s
@@ -196,7 +196,7 @@ def test_an_identity_on_two_landmarks_is_named(make: Any, in_map: bool) -> None:
     """At both ends of the field, which the robot passes in turns: 12 m are between them."""
     recording, world = make(), World(seed=4)
     given = world.map_in_plane() if make is in_plane else world.map_in_space()
-    result = run_slam(renamed(recording, {14: 11}), prior_map=given if in_map else None)
+    result = run_slam(rename(recording, {14: 11}), prior_map=given if in_map else None)
     (cause,) = result.causes
     assert (cause.code, cause.subject) == ("double-identity", "11")
     if make is in_plane:
@@ -214,7 +214,7 @@ def test_an_identity_on_two_landmarks_is_named(make: Any, in_map: bool) -> None:
 def test_an_identity_that_is_read_elsewhere_is_not_on_two_landmarks(make: Any) -> None:
     """One that another landmark carries, for a while: that one is read wrongly; and one that was carried off once."""
     recording = make()
-    some = renamed(recording, {14: 11}, until_s=6.0)
+    some = rename(recording, {14: 11}, until_s=6.0)
     names = [cause.code for cause in run_slam(some).causes]
     assert "double-identity" not in names
 

@@ -25,7 +25,7 @@ MAKES: dict[str, Callable[[World], Any]] = {
 }
 
 
-def joined(one: Any, other: Any) -> Any:
+def join(one: Any, other: Any) -> Any:
     """Detections of both, in the order of their frames."""
     columns = {each.name: (getattr(one, each.name), getattr(other, each.name)) for each in fields(one)}
     both = {name: np.concatenate(pair) for name, pair in columns.items() if np.shape(pair[0])[:1] == (len(one),)}
@@ -51,7 +51,7 @@ def with_rider(recording: Any, *, moves: float = 0.0) -> Any:
     else:
         more["position_sensor_m"] = rides.position_sensor_m * (1.0 + 0.004 * noise * random.normal(size=(n, 3)))
     rides = replace(rides, **more)
-    return replace(recording, detections=joined(seen, rides))
+    return replace(recording, detections=join(seen, rides))
 
 
 @pytest.mark.parametrize("kind", MAKES)
@@ -139,7 +139,7 @@ def test_a_landmark_that_is_driven_around_stands() -> None:
         rows, frame=frames, landmark_id=np.full(len(frames), NAME),
         range_m=np.full(len(frames), np.hypot(*pole)), bearing_rad=np.full(len(frames), np.arctan2(pole[1], pole[0])),
     )  # fmt: skip
-    assert not len(find_riders(replace(given, odometry=circle, detections=joined(seen, at)), USUAL))
+    assert not len(find_riders(replace(given, odometry=circle, detections=join(seen, at)), USUAL))
 
 
 def test_an_odometry_in_millimetres_puts_no_landmark_on_the_robot() -> None:

@@ -361,10 +361,10 @@ def test_directions_have_no_scale() -> None:
     recording = World(seed=1, seconds=10.0).space(corners=False)
     of_lengths = {"range-scale", "tag-size", "sensor-scale"}
 
-    def asked(given: SpatialRecording) -> set[tuple[str, str]]:
+    def list_asked(given: SpatialRecording) -> set[tuple[str, str]]:
         suspects = list_suspects(Inputs.of(given, None), calibrations=True)
         return {(one.code, one.subject) for one in suspects if one.code in of_lengths}
 
-    assert asked(only_directions(recording)) == set()
-    assert asked(recording) == {("range-scale", "sensor"), ("sensor-scale", "front"), ("sensor-scale", "back")}
-    assert asked(only_directions(recording, 1)) == {("range-scale", "sensor"), ("sensor-scale", "front")}
+    assert list_asked(only_directions(recording)) == set()
+    assert list_asked(recording) == {("range-scale", "sensor"), ("sensor-scale", "front"), ("sensor-scale", "back")}
+    assert list_asked(only_directions(recording, 1)) == {("range-scale", "sensor"), ("sensor-scale", "front")}

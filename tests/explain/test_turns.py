@@ -27,11 +27,11 @@ from .worlds import World
 NAN = float("nan")
 
 
-def recorded(world: World, kind: str) -> Any:
+def record(world: World, kind: str) -> Any:
     return world.plane() if kind == "plane" else world.space(corners=kind == "corners")
 
 
-def scored(recording: AnyRecording) -> dict[str, scores.CalibrationScore]:
+def score(recording: AnyRecording) -> dict[str, scores.CalibrationScore]:
     """Return what a session tells of odometry that is solved as given, by codes."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
     visit, _, inputs = session.explained(Inputs.of(recording, None), config, ())
@@ -46,7 +46,7 @@ def state_of(result: SlamResult, name: str) -> float:
     "kind", ["plane", *(pytest.param(name, marks=pytest.mark.slow) for name in ("corners", "poses"))]
 )
 def test_a_gyroscope_whose_zero_is_off_is_named_and_put_right(kind: str) -> None:
-    result = run_slam(recorded(World(seed=1, drift=0.002, bias_radps=-0.03), kind))
+    result = run_slam(record(World(seed=1, drift=0.002, bias_radps=-0.03), kind))
     (cause,) = result.causes
     assert (cause.code, cause.subject, cause.probability) == ("turn-bias", "odometry", 1.0)
     assert cause.value == pytest.approx(-0.03, abs=0.001)
@@ -81,20 +81,20 @@ def test_turns_of_another_scale_are_named_in_space() -> None:
 
 @pytest.mark.parametrize("kind", ["plane", "corners"])
 def test_what_every_robot_has_is_not_named(kind: str) -> None:
-    result = run_slam(recorded(World(seed=1, bias_radps=0.005, turns=1.02), kind))
+    result = run_slam(record(World(seed=1, bias_radps=0.005, turns=1.02), kind))
     assert not result.causes
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SOUND
 
 
 def test_zero_and_scale_are_told_from_each_other() -> None:
-    found = scored(World(seed=1, drift=0.002, bias_radps=0.02, turns=0.95).space())
+    found = score(World(seed=1, drift=0.002, bias_radps=0.02, turns=0.95).space())
     assert found["turn-bias"].value == pytest.approx(0.02, abs=0.003)
     assert found["turn-scale"].value == pytest.approx(np.log(0.95), abs=0.01)
     assert is_unusual(found["turn-bias"])
     assert is_unusual(found["turn-scale"])
     assert "odometry-scale" not in found  # it is a state
-    assert set(scored(World(seed=1).plane())) == {"turn-bias"}
+    assert set(score(World(seed=1).plane())) == {"turn-bias"}
 
 
 def test_what_is_left_of_a_zero_is_added_to_what_was_undone() -> None:
@@ -130,7 +130,7 @@ def test_errors_that_last_are_no_zero_that_is_off() -> None:
     wander = np.repeat(np.random.default_rng(5).normal(size=9), -(-len(driven) // 9))[: len(driven)]
     wander += 0.5 - wander.mean()
     off = replace(recording, odometry=replace(driven, angular_radps=driven.angular_radps + 0.03 * wander))
-    (found,) = scored(off).values()
+    (found,) = score(off).values()
     assert found.value == pytest.approx(0.015, abs=0.005)
     assert 0.5 * (found.value / found.sigma) ** 2 > 2.0 * found.gain
     assert not is_unusual(found)

@@ -16,7 +16,7 @@ from evermap_studies.causes.mistakes import mounted
 CONFIG = Config()
 
 
-def seen_through(tilt: tuple[float, float], noise: float = 0.02, count: int = 400, wrong: float = 0.0) -> np.ndarray:
+def look_through(tilt: tuple[float, float], noise: float = 0.02, count: int = 400, wrong: float = 0.0) -> np.ndarray:
     """How far apart two sightings are, over their range, through a mount that is tilted; a share has wrong heights."""
     random = np.random.default_rng(3)
     apart = random.normal(0.0, [0.3, 0.2, 0.0], (count, 3))
@@ -30,19 +30,19 @@ def seen_through(tilt: tuple[float, float], noise: float = 0.02, count: int = 40
 def test_a_mount_is_tilted_by_more_than_any_robots(axis: int, sign: float) -> None:
     for by, expected in ((0.0, False), (0.04, False), (0.06, True), (0.17, True)):
         tilt = (sign * by, 0.01) if axis == 0 else (0.01, sign * by)
-        assert is_tilted(seen_through(tilt)) is expected
+        assert is_tilted(look_through(tilt)) is expected
 
 
 def test_wrong_heights_tilt_nothing_and_hide_no_tilt() -> None:
-    assert not is_tilted(seen_through((0.03, 0.0), wrong=0.25))
-    assert is_tilted(seen_through((0.07, 0.0), wrong=0.25))
+    assert not is_tilted(look_through((0.03, 0.0), wrong=0.25))
+    assert is_tilted(look_through((0.07, 0.0), wrong=0.25))
 
 
 def test_a_tilt_is_told_where_it_is_known() -> None:
     """Of 20 pairs with heights that are off by .3 of their range nobody knows, nor of those that go one way alone."""
-    assert not is_tilted(seen_through((0.1, 0.0), noise=0.3, count=20))
-    assert not is_tilted(seen_through((0.1, 0.1))[:2])
-    assert not is_tilted(seen_through((0.1, 0.0)) * [1.0, 0.0, 1.0])
+    assert not is_tilted(look_through((0.1, 0.0), noise=0.3, count=20))
+    assert not is_tilted(look_through((0.1, 0.1))[:2])
+    assert not is_tilted(look_through((0.1, 0.0)) * [1.0, 0.0, 1.0])
 
 
 def driven(seed: int, **off: float) -> Any:

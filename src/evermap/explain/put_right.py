@@ -90,14 +90,11 @@ def solve_with_right_turns(
     left = {one.suspect.code: one for one in score_odometry(now.session, inputs)}
     if any(is_unusual(one) for one in left.values()):
         return None
-    known = [(one, left.get(one.suspect.code)) for one in off]
-    return (
-        inputs,
-        now,
-        tuple(
-            one if more is None else Taken(one.suspect, one.state + more.value, more.sigma**-2) for one, more in known
-        ),
-    )
+    taken = list[Taken]()
+    for one in off:
+        more = left.get(one.suspect.code)
+        taken.append(one if more is None else Taken(one.suspect, one.state + more.value, more.sigma**-2))
+    return inputs, now, tuple(taken)
 
 
 def add_late_sensor(explained: Explained[VisitT], late: Taken, result: SlamResult) -> Explained[VisitT]:
