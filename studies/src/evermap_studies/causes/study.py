@@ -275,7 +275,9 @@ def draw(rows: Sequence[Row]) -> Figure:
         axes.imshow(share, cmap="RdYlGn", vmin=0.0, vmax=1.0, aspect="auto")
         for line, values in enumerate(share):
             for column, value in enumerate(values):
-                axes.text(column, line, "" if np.isnan(value) else f"{value:.0%}", ha="center", va="center", fontsize=7)
+                said, ink = "" if np.isnan(value) else f"{value:.0%}", "black" if 0.15 < value < 0.85 else "white"
+                axes.text(column, line, said, ha="center", va="center", fontsize=7, color=ink)
+        axes.grid(visible=False)
         names = ["plane, map", "plane, alone", "space, map", "space, alone"]
         axes.set_xticks(range(4), names)
         axes.set_yticks(range(len(causes)), [cause or "nothing" for cause in causes])
