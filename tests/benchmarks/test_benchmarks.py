@@ -66,6 +66,7 @@ def test_streaming_and_batch_agree(run: ModuleType, worlds: dict[bool, Any]) -> 
     assert apart(run.CONTENDERS["isam2"][1](worlds[False]), run.CONTENDERS["batch"][1](worlds[False])) < 0.05
 
 
+@pytest.mark.slow
 def test_free_calibration_explains_the_readings_no_worse(run: ModuleType, worlds: dict[bool, Any]) -> None:
     """With nominal sensors the calibrated answer is as near to the truth as the other, give or take its own doubt."""
     world = worlds[True]
@@ -204,6 +205,7 @@ def test_both_who_race_in_a_known_map_find_the_way(run: ModuleType) -> None:
         assert np.abs(se2.log(se2.between(one, other))).max() < 0.05
 
 
+@pytest.mark.slow
 def test_learning_cliques_of_the_race_are_all_looked_at_and_learned_from(run: ModuleType) -> None:
     """Nobody saves time by leaving something out, and the memory is that of all arrays."""
     scene = run.cliques.world(40)

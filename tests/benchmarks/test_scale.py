@@ -168,6 +168,7 @@ def test_what_takes_too_long_is_told_as_not_run(scale_maps: ModuleType) -> None:
     assert found == {"places": 100_000, "not_run": "not done after 0 s"}
 
 
+@pytest.mark.slow
 def test_a_filled_map_can_be_kept_and_entered(scale_maps: ModuleType, tmp_path: Path) -> None:
     """A session is found in it and nothing changes, wherever the robot starts."""
     config = WarehouseConfig(n_landmarks=60, landmarks_per_aisle=20, aisles_driven=1)

@@ -170,6 +170,7 @@ def in_the_field(
     return nominal_lines(nominal), np.ones(len(nominal), dtype=np.bool_)
 
 
+@pytest.mark.slow
 def test_what_is_hidden_is_not_gone_and_what_is_gone_is_not_hidden(building: BuildingSimulation) -> None:
     """Measured: Brier score .0013, precision and recall .999; by the nominal field of view .018, 1.000 and .968."""
     learned, table = follow(building, known_to_be_clear)

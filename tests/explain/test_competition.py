@@ -316,7 +316,8 @@ def test_another_focal_length_is_named_where_lengths_contradict_each_other(times
     assert error_m(result, recording, in_map=False) < 0.02
 
 
-@pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [False, True])
 def test_a_centre_of_the_image_that_is_elsewhere_is_named(mapped: bool) -> None:
     """All else seems sound: noise takes in what the images are off by."""
     recording, survey = recorded(World(seed=1), "corners")
@@ -372,7 +373,10 @@ def trial_under(inputs: Inputs, suspect: Suspect, state: float) -> tuple[Trial[V
 @pytest.mark.parametrize(
     ("world", "name", "state", "true", "within"),
     [
-        (World(seed=3, sizes={5: 1.3}), ("tag-size", "5"), 0.6 * np.log(1.3), np.log(1.3), 0.005),
+        pytest.param(
+            *(World(seed=3, sizes={5: 1.3}), ("tag-size", "5"), 0.6 * np.log(1.3), np.log(1.3), 0.005),
+            marks=pytest.mark.slow,
+        ),
         # of a lens the state is set, not added to what is stated, and k2 is another than its square
         (World(seed=8, bent=-0.2), ("distortion", "front, back"), -0.23, -0.2, 0.02),
     ],

@@ -171,6 +171,7 @@ def test_frames_that_saw_nothing_are_no_jump() -> None:
     assert not run_slam(displaced_unseen(1.0, 0.0)).causes
 
 
+@pytest.mark.slow
 def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
     """Alone, tags of another size than stated only bend the odometry, which is taken for noisy."""
     result = run_slam(World(seed=4, longer=1.25).space())

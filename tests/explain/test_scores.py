@@ -126,6 +126,7 @@ def test_a_delay_that_was_estimated_is_not_held(late_s: float) -> None:
     assert found.suspected is None
 
 
+@pytest.mark.slow
 def test_scores_of_true_calibrations_are_standard_normal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if noise of the odometry is as large as its motions, and turns the robot about one of three axes only."""
     monkeypatch.setattr(scores, "CHANCE", 0.0)

@@ -328,6 +328,7 @@ def test_an_edit_is_told_beside_the_changes(site: Path, tmp_path: Path) -> None:
         assert diff(store, head - 1).changes == tuple(c for c in diff(store, head - 1, head).changes)
 
 
+@pytest.mark.slow
 def test_a_late_session_is_told_as_if_it_had_come_in_time(site: Path, tmp_path: Path) -> None:
     """It, those after it, and whatever lies between two instants; the instant of the newest map stays as it was."""
     with open_store(tmp_path / "late.evermap", create=True) as store, open_store(site) as in_time:

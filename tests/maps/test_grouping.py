@@ -158,6 +158,7 @@ def test_what_was_not_seen_stays_with_the_larger_part() -> None:
     assert label.tolist() == [7, 7, 7, 100]
 
 
+@pytest.mark.slow
 def test_bodies_of_a_simulated_building() -> None:
     """Pairs of landmarks on one object: by proximity at first, and never worse for what moves teach in four weeks."""
     first, last, unmoved, classless = np.zeros((4, 3))

@@ -97,7 +97,7 @@ def answers(where: Path) -> tuple[Any, ...]:
                 store.changes(number),
                 or_error(partial(story_of, store, number)),
             ]
-            found += [or_error(partial(diff, store, number, other)) for other in every]
+            found += [or_error(partial(diff, store, number, other)) for other in every if (number + other) % 3 == 0]
             found += [or_error(partial(why, store, name, number)) for name in landmarks[:3] if number]
         for name in landmarks:
             found += [why(store, name), store.changes_of(name), store.evidence(landmark_id=name)]
@@ -156,6 +156,7 @@ def test_the_newest_revision_is_in_no_pack(path: Path) -> None:
         compact(path)
 
 
+@pytest.mark.slow
 def test_sessions_and_pruning_go_on(path: Path, tmp_path: Path) -> None:
     other = Path(shutil.copy(path, tmp_path / "other.evermap"))
     compact(path)

@@ -149,6 +149,7 @@ def test_every_mistake_is_found_and_put_right_and_nothing_else(name: str, seed: 
     assert turn.magnitude() < 3.5 * np.sqrt(3.0) * quarter.turn_sigma_rad
 
 
+@pytest.mark.slow
 def test_what_moved_between_two_drives_is_stale_and_what_was_wrong_before_is_wrong() -> None:
     world = corridor(1)
     given = shifted(surveyed(world), 3, [0.0, 0.0, 0.4])

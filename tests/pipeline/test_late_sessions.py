@@ -111,12 +111,13 @@ def test_an_interrupt_while_later_sessions_are_entered_again_leaves_the_map(
         assert store.head() == 2
 
 
-@pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2)])
+@pytest.mark.parametrize("order", [(0, 2, 3, 1), pytest.param((3, 1, 0, 2), marks=pytest.mark.slow)])
 def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: LivingMap, order: Sequence[int]) -> None:
     with open_store(begun(tmp_path, *order)) as store:
         assert_same(store.load(), in_order)
 
 
+@pytest.mark.slow
 def test_a_late_session_with_which_a_later_one_is_lost_stays_out(tmp_path: Path) -> None:
     """Neither shows enough of what the other has: the map keeps the one that it has."""
     days = simulate_building(BuildingConfig(days=8, patrol_s=30.0), 10).sessions
@@ -218,9 +219,8 @@ def spoken(change: MapChange) -> str:
     return str((change.kind.value, change.landmark_ids, rounded, change.n_hits, change.n_misses))
 
 
-@pytest.mark.parametrize(
-    "order", [ANYHOW[-1], *(pytest.param(one, marks=pytest.mark.slow) for one in ANYHOW[1:-1])], ids=str
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ANYHOW[1:], ids=str)
 def test_the_story_does_not_depend_on_who_tells_it_first(order: tuple[int, ...]) -> None:
     """Of all sessions, and between any two instants, changes and probabilities are the same to 1e-6."""
     wanted, found = tell_in(ANYHOW[0]), tell_in(order)

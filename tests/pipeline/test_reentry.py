@@ -118,6 +118,7 @@ def test_what_operators_said_stays_at_its_time_and_surveyed_landmarks_are_the_be
         assert [item.provenance.kind.value for item in store.log()[5:]] == ["revert", *["session", "edit"] * 2]
 
 
+@pytest.mark.slow
 def test_what_was_stopped_is_continued(tmp_path: Path, otherwise: LivingMap, monkeypatch: pytest.MonkeyPatch) -> None:
     path, work = tmp_path / "site.evermap", tmp_path / "again.evermap"
     begun(path, 0, 1, 2, 3)
@@ -181,6 +182,7 @@ def test_where_a_session_is_not_found_any_more_the_map_stays(tmp_path: Path, mon
     assert path.read_bytes() == data
 
 
+@pytest.mark.slow
 def test_sites_are_entered_alike_in_one_process_and_in_many(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     for site, order in {"dock": (0,), "hall": (2, 0)}.items():

@@ -110,6 +110,7 @@ def test_what_a_map_was_told_is_no_evidence() -> None:
         np.testing.assert_array_equal(getattr(ClassEvidence.of(told), name), getattr(ClassEvidence.of(living), name))
 
 
+@pytest.mark.slow
 def test_a_store_of_maps_and_workers_give_the_same_bytes(maps: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     assert run("--store", maps, "--out", tmp_path / "one", "--workers", "1").exit_code == 0

@@ -92,7 +92,9 @@ def health(url: str) -> dict[str, int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL]
+)
 def test_workers_are_replaced_and_end_with_their_server(tmp_path: Path, number: signal.Signals) -> None:
     store = tmp_path / "maps"
     with serving(store, "--workers", "1") as (process, url):

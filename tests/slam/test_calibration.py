@@ -477,6 +477,7 @@ def test_a_gyroscope_that_jitters_on_the_straight_says_nothing_of_its_scale(seed
     assert np.sqrt(np.mean(off**2)) < 2.0 * np.sqrt(result.trajectory.covariance[:, 2, 2].mean())
 
 
+@pytest.mark.slow
 def test_poses_in_a_map_are_known_as_well_as_the_place_of_the_sensor_on_the_robot():
     """Mounts of robots are off by 4 cm, on most axes of six in ten: poses were held to be surer than they are (2.3)."""
     nees = []

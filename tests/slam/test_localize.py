@@ -52,7 +52,9 @@ def within_chance(total: float, degrees: int) -> bool:
     return bool(low < total < high)
 
 
-@pytest.mark.parametrize("sigma_m", [0.003, pytest.param(0.05, marks=pytest.mark.slow), 0.15])
+@pytest.mark.parametrize(
+    "sigma_m", [0.003, *(pytest.param(sigma_m, marks=pytest.mark.slow) for sigma_m in (0.05, 0.15))]
+)
 def test_pose_and_calibration_are_as_uncertain_as_the_filter_says(sigma_m):
     """Also where the map is three times worse than the sensor and 150 frames look at the same places of it."""
     of_pose, of_states, runs = 0.0, 0.0, 40

@@ -53,13 +53,9 @@ def told(seed: int, turn_scale: float, *, blind: bool, view_rad: float = np.pi) 
     return error, np.array([one.covariance for one in found])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("turn_scale", "blind", "view_rad"),
-    [
-        pytest.param(0.05, False, np.pi, marks=pytest.mark.slow),
-        (0.1, True, np.pi),
-        pytest.param(0.1, True, 0.6, marks=pytest.mark.slow),
-    ],
+    ("turn_scale", "blind", "view_rad"), [(0.05, False, np.pi), (0.1, True, np.pi), (0.1, True, 0.6)]
 )
 def test_poses_are_as_uncertain_as_the_filter_says(turn_scale, blind, view_rad):
     runs = 40

@@ -256,6 +256,7 @@ def scored(recordings: list[Recording], results: list[SlamResult], first: int | 
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_robots_that_see_each_other_are_surer_and_right() -> None:
     """Also where every fifth names another robot; errors are as large as they say."""
     alone, shared, met = [], [], []

@@ -303,7 +303,7 @@ def described(
     return path, entered.session
 
 
-@pytest.mark.parametrize("shift", [0.0, 1.0])
+@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_exchanged_landmarks_are_recognised_by_what_they_are_like(
     lived: tuple[BuildingSimulation, list[Session]], described: tuple[Path, Session], shift: float, tmp_path: Path
 ) -> None:

@@ -193,6 +193,7 @@ def test_an_exchange_of_two_landmarks_is_seen() -> None:
     assert gained > 2.0 * READINGS.most_readings * READINGS.misread_nats
 
 
+@pytest.mark.slow
 def test_a_useless_column_changes_nothing_and_a_good_one_no_identity() -> None:
     recording = first_seconds(building(3).sessions[0], 45.0)
     seen, rng = recording.detections, np.random.default_rng(7)

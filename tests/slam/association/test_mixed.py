@@ -127,6 +127,7 @@ def test_a_name_helps_a_robot_that_is_lost() -> None:
     assert some_named < 1.3 * all_named
 
 
+@pytest.mark.slow
 def test_without_any_name_it_is_as_if_ids_were_ignored() -> None:
     recording = with_some_named(building(2).sessions[0], 0.0)
     one, other = (with_identities(recording, SlamConfig(unknown_ids=each)) for each in (True, "empty"))

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from space.corridors import tagged_corridor
 
 from evermap.config import AssociationConfig, Config, Section, SlamConfig
@@ -39,6 +40,7 @@ def keys(section: Section, prefix: str) -> Iterator[str]:
         yield from keys(value, f"{key}.") if isinstance(value, Section) else [key]
 
 
+@pytest.mark.slow
 def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     """A park with some identities and a radius, again without these in a map of over 100 trees; a map that lies over
     another one; tags, and points of a map, in space.

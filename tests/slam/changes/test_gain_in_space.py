@@ -109,7 +109,7 @@ def test_gain_of_displacements_is_the_difference_of_log_marginal_likelihoods(num
     ("numbers", "label", "degrees"),
     [
         (POINTS, [0, 1, 1, 0, 1, 0], 70.0),
-        (PLACES, [0, 1, 1, 0, 1, 0], 50.0),
+        pytest.param(PLACES, [0, 1, 1, 0, 1, 0], 50.0, marks=pytest.mark.slow),
         pytest.param(PLACES, [0, 0, 0, 1, 0, 0], 40.0, marks=pytest.mark.slow),
     ],
 )

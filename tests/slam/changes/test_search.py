@@ -29,7 +29,7 @@ def test_search_finds_the_best_of_all_hypotheses() -> None:
     enumerated = {count: all_labellings(count, PRIOR.most_groups) for count in (7, 8)}
     assert [len(enumerated[count]) for count in (7, 8)] == [3845, 18002]
     found = 0
-    for seed in range(75):
+    for seed in range(40):
         position, comparison = random_comparison(seed)
         hypotheses = exhausted(find_changes(static_evidence(position), comparison, position, 1, PRIOR))
         labels = enumerated[len(position)]
@@ -40,8 +40,7 @@ def test_search_finds_the_best_of_all_hypotheses() -> None:
         expected = [row[tuple(label)] for label in hypotheses.label[:50]]
         np.testing.assert_allclose(hypotheses.gain[:50], expected, atol=1e-5)
         found += np.array_equal(hypotheses.label[0], labels[best])
-    print("found", found)
-    assert found >= 74
+    assert found >= 39
 
 
 def test_weights_of_what_was_kept_are_nearly_those_of_everything() -> None:

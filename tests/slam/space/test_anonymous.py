@@ -183,7 +183,8 @@ def named_as(recording: SpatialRecording, found: SpatialRecording) -> dict[int, 
     return {int(one): int(np.bincount(true[real & (name == one)]).argmax()) for one in np.unique(name[real])}
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_points_are_found_in_a_fixed_map_from_anywhere_and_new_ones_get_numbers_of_their_own(seed):
     """The odometry of the drive starts in a frame that is turned about all axes."""
     drive = part_of_hall(hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05), 200, 400, tilt(seed))
@@ -234,6 +235,7 @@ def test_another_hall_is_refused():
     assert len(session.living.places) == len(begun.living.places)
 
 
+@pytest.mark.slow
 def test_points_that_were_exchanged_are_recognised_by_what_they_are_like():
     whole = hall(1, n_points=60, n_frames=400, step_s=0.6, drift=0.05)
     own, random = np.random.default_rng(5).normal(size=(61, 8)), np.random.default_rng(6)
@@ -257,6 +259,7 @@ def test_points_that_were_exchanged_are_recognised_by_what_they_are_like():
     assert [change.kind for change in run_session(second, begun.living, NAMELESS).changes] == []
 
 
+@pytest.mark.slow
 def test_objects_that_look_the_same_however_they_are_turned_keep_their_names_over_sessions():
     room = Room.of(1)
     walks = [room.walk(10 + day, day=day) for day in range(2)]

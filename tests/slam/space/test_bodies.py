@@ -19,7 +19,7 @@ from evermap_studies.worlds.yard import YardConfig, YardDrive, simulate_yard
 DRIVING = YardConfig(moving=6, parked=0)
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["poses", "points"])
+@pytest.fixture(scope="module", params=[pytest.param(True, marks=pytest.mark.slow), False], ids=["poses", "points"])
 def run(request: pytest.FixtureRequest) -> tuple[YardDrive, SlamResult]:
     drive = simulate_yard(replace(DRIVING, oriented=request.param), seed=1)[0]
     return drive, em.run_slam(drive.recording)

@@ -309,6 +309,7 @@ def test_the_frame_of_an_odometry_may_be_that_of_the_map() -> None:
     assert away.min(axis=0).max() < 1.0
 
 
+@pytest.mark.slow
 def test_deleted_boxes_stay_away_and_large_maps_are_the_same(days: Days) -> None:
     made, sessions = days[1, False]
     first = sessions[0].living

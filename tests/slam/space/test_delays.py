@@ -96,7 +96,14 @@ def test_stops_hide_no_delay_in_space():
     assert delay.value == pytest.approx(0.2, abs=0.025)
 
 
-@pytest.mark.parametrize(("late_s", "frame_s"), [(0.2, 0.1), (0.24, 0.1), (0.24, 0.2), (0.0, 0.1), (-0.2, 0.1)])
+@pytest.mark.parametrize(
+    ("late_s", "frame_s"),
+    [
+        (0.0, 0.1),
+        (0.2, 0.1),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((0.24, 0.1), (0.24, 0.2), (-0.2, 0.1))),
+    ],
+)
 def test_a_delay_shorter_than_a_step_of_slow_odometry_is_found_in_space(late_s, frame_s):
     """Frames are denser than the odometry, whose stamps are some of theirs where all are by one clock.
 

@@ -49,6 +49,7 @@ def told(result: SlamResult, name: str) -> tuple[float, float, float]:
     return one.value, one.sigma, one.prior_sigma
 
 
+@pytest.mark.slow
 def test_the_odometers_scale_is_found_with_a_laser() -> None:
     """Without a kind the odometry's metre is trusted where it is 4 % too short."""
     trusting, stated = (run_slam(driven(odometry=1.0 / 1.04, **sheet)) for sheet in ({}, {"kind": SensorKind.LASER}))

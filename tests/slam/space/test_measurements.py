@@ -137,7 +137,7 @@ def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind, be
     assert np.all(hits == len(stamp_s) // len(beacon))
 
 
-@pytest.mark.parametrize("kind", ["ranges", "bearings"])
+@pytest.mark.parametrize("kind", ["ranges", pytest.param("bearings", marks=pytest.mark.slow)])
 def test_landmarks_that_are_only_measured_are_mapped_without_odometry(kind):
     """Points are begun from constellations; from the origin ranges would draw the drive elsewhere."""
     random, recording = np.random.default_rng(4), hall(3, n_points=40, n_frames=150, drift=0.05)

@@ -96,6 +96,7 @@ def test_odometry_or_a_map_tell_the_metre():
     assert consider_range_errors(solve(recording, known).optimum).shape[1] == 0
 
 
+@pytest.mark.slow
 def test_without_odometry_a_data_sheet_says_how_well_the_metre_is_known():
     recording = carry_stereo(3, 0.0)
     stated = replace(recording, sensors=tuple(replace(one, sigma_scale=0.02) for one in recording.sensors))

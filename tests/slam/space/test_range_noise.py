@@ -209,8 +209,14 @@ def test_lengths_are_not_too_short_by_noise_that_grows() -> None:
     assert spread[0] / spread[1] == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("law", ["constant", "stereo"])
-@pytest.mark.parametrize("in_map", [False, True])
+@pytest.mark.parametrize(
+    ("law", "in_map"),
+    [
+        ("constant", False),
+        ("stereo", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("constant", True), ("stereo", False))),
+    ],
+)
 def test_a_sensor_without_a_data_sheet_is_no_suspect(law: str, in_map: bool) -> None:
     """With one level: errors of odometry alternate, or detections are noisier than sensors are."""
     recording = field(9, LAWS[law], n_frames=400)

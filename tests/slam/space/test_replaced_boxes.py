@@ -41,6 +41,7 @@ def told() -> list[tuple[bool, float | None, Counter[int], list[MapChange]]]:
     return found
 
 
+@pytest.mark.slow
 def test_others_in_the_same_place_are_told_and_what_stands_is_not(told) -> None:
     another = np.array([row[0] for row in told])
     p = np.array([np.nan if row[1] is None else row[1] for row in told])
@@ -52,6 +53,7 @@ def test_others_in_the_same_place_are_told_and_what_stands_is_not(told) -> None:
     assert another[p >= 0.5].mean() >= sure.mean() - 2.0 * np.sqrt((sure * (1.0 - sure)).mean() / len(sure))
 
 
+@pytest.mark.slow
 def test_what_was_replaced_is_not_told_as_two_facts(told) -> None:
     assert all(row[1] is not None for row in told)
     assert max(max(row[2].values(), default=0) for row in told) <= 1

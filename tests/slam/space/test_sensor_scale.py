@@ -41,6 +41,7 @@ def test_of_three_sensors_the_odd_one_is_off():
     assert found == pytest.approx([0.0, -np.log(1.08), 0.0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_sensor_is_named_and_the_run_is_solved_under_it():
     given = field(11, LAWS["lidar"], LAWS["lidar"], n_frames=100)
     right, wrong = with_scale(given, 1.0), with_scale(given, 1.08)

@@ -34,7 +34,9 @@ def off(session: Session, site: Site) -> np.ndarray:
     return np.asarray(np.linalg.norm(se3.transform(rigid(found, true), found) - true, axis=1))
 
 
-@pytest.mark.parametrize(("seed", "odometry"), [(0, True), pytest.param(1, True, marks=pytest.mark.slow), (2, False)])
+@pytest.mark.parametrize(
+    ("seed", "odometry"), [*(pytest.param(seed, True, marks=pytest.mark.slow) for seed in (0, 1)), (2, False)]
+)
 def test_what_was_moved_turned_taken_and_brought_back_is_told_when_it_is_seen(seed: int, odometry: bool) -> None:
     site = Site.of(seed)
 
@@ -66,7 +68,8 @@ def test_what_was_moved_turned_taken_and_brought_back_is_told_when_it_is_seen(se
     assert min(p.values()) > 0.9
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_the_same_without_identities(seed: int) -> None:
     """A tag that was moved by its neighbour's distance is another one; one that is turned in its place is the same."""
     site, true = Site.of(seed), dict[int, int]()

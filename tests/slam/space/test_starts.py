@@ -112,7 +112,7 @@ def test_frames_that_reject_what_they_see_are_located_again():
     assert np.max(se3.angle_between(found.pose[seen], true[seen])) < 0.1
 
 
-@pytest.mark.parametrize("seed", [0, 6, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3, 4, 5, 7))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))])
 def test_small_tags_without_odometry_are_mapped_as_from_the_truth(seed):
     """Tags of which hardly a view tells which way they face, 1 of 200 read as another.
 
