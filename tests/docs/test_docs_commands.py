@@ -29,7 +29,7 @@ GENERATED = "reference/"
 """Pages that exist only in the site; `mkdocs build --strict` checks what leads there."""
 TIMEOUT_S = 300
 NUMBER = re.compile(r"([-+]?\d+(?:\.\d+)?)")
-LONG = re.compile(r"evermap (?:demo|slam(?! --init)|simulate|check|live)")
+LONG = re.compile(r"evermap (?:demo|slam|map enter|together|localize|simulate|check|live)")
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def simulate(
         if as_json:
             print_json({"out": str(where), "sessions": names, "seed": seed})
         else:
-            say(f"wrote {len(names)} sessions to {where}; next: evermap slam {where / names[0]} --map {world}.map")
+            say(f"wrote {len(names)} sessions to {where}; next: evermap map enter {world}.map {where / names[0]}")
         return
     out = where
     from evermap.io import write_native
