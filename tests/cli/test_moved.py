@@ -57,6 +57,7 @@ NEW = {
     # evermap slam
     "slam rec --method nn": "slam rec --set slam.method=nn",
     "slam rec --sensor-model plain --set seed=3": "slam rec --set seed=3 --set slam.sensor_model=plain",
+    "slam rec --method nn --method em": "slam rec --set slam.method=em",
     "slam rec --empty-ids": "slam rec --set slam.unknown_ids=empty",
     "slam rec --map m --out o": "map enter m rec --out o",
     "slam a b --map=m --prior cart=never-leaves": "map enter m a b --prior cart=never-leaves",
