@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 from evermap import plugins
+from evermap.cli import reproduce
 from evermap.cli.main import app
 from evermap.cli.moved import MOVED, options_of, renew, write_number, write_text
 from evermap.cli.options import workers_of
@@ -49,8 +50,39 @@ def test_a_verb_has_at_most_ten_options(verb: str) -> None:
     assert len(shown(verb)) <= MOST
 
 
-def test_verbs_of_studies_do_not_count() -> None:
-    assert not set(plugins.found("evermap.verbs")) & {name for name, _ in verbs()}
+@pytest.mark.parametrize("group", ["evermap.verbs", "evermap.studies"])
+def test_so_has_one_of_another_package(group: str) -> None:
+    assert plugins.found(group)
+    for name in plugins.found(group):
+        found = options_of(reproduce.command(group, name))
+        assert len({one.opts[0] for one in found.values() if not one.hidden} - {"--help"}) <= MOST, name
+
+
+def test_options_of_another_package_move_by_its_own_table(tmp_path: Path) -> None:
+    lines = []
+    for name, given in (("old", ["--standing", "--plane"]), ("new", ["--with", "standing", "--with", "plane"])):
+        result = run("simulate", "yard", tmp_path / name, "--days", "1", "--moving", "1", *given)
+        assert result.exit_code == 0, result.stderr
+        lines.append(result.stderr.splitlines()[-1])
+    made = shlex.join(["simulate", "yard", str(tmp_path / "old"), "--days", "1", "--moving", "1"])
+    assert lines[0] == f"evermap: --standing and --plane are now: evermap {made} --with standing --with plane"
+    assert " now: " not in lines[1]
+    files = [sorted(file.relative_to(tmp_path / name) for file in (tmp_path / name).rglob("*") if file.is_file())
+             for name in ("old", "new")]  # fmt: skip
+    assert files[0] == files[1]
+    for file in files[0]:
+        if not file.name.startswith("."):
+            assert (tmp_path / "old" / file).read_bytes() == (tmp_path / "new" / file).read_bytes(), file
+
+
+def test_rows_of_a_study_are_chosen_by_one_option() -> None:
+    moved = {"reproduce nielsen2024": plugins.load("evermap.studies", "nielsen2024").moved}
+    found = options_of(reproduce.command("evermap.studies", "nielsen2024"))
+    old = "reproduce nielsen2024 --dataset 6 --robot 1 --method joint --sensor ours --quick"
+    new = "reproduce nielsen2024 --quick --only dataset=6 --only robot=1 --only method=joint --only sensor=ours"
+    assert renew(old.split(), lambda _: found, moved)[0] == new.split()
+    for wrong in ("dataset=six", "size=1", "joint"):
+        assert "names no rows" in run("reproduce", "nielsen2024", "--only", wrong).stderr
 
 
 NEW = {

@@ -71,7 +71,12 @@ class Verbs(TyperGroup):
                 found = found.get_command(ctx, word)
             return moved.options_of(found)
 
-        args, ctx.meta[moved.NOW] = moved.renew(args, options_of)
+        tables = moved.MOVED
+        group, words = ("evermap.studies", args[1:2]) if args[0] == "reproduce" else ("evermap.verbs", args[:1])
+        if words and words[0] in plugins.found(group):  # options of it that its package has moved
+            name = " ".join(args[:2] if args[0] == "reproduce" else args[:1])
+            tables = {name: getattr(plugins.load(group, words[0]), "moved", {})}
+        args, ctx.meta[moved.NOW] = moved.renew(args, options_of, tables)
         return super().resolve_command(ctx, args)
 
     def main(self, *args: Any, **kwargs: Any) -> Any:

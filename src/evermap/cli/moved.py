@@ -47,13 +47,15 @@ class Moved(NamedTuple):
     Attributes:
         takes: whether a value follows it.
         key: what it sets, if it only sets a key.
-        write: writes its value.
+        write: writes its value; '' where `key` says it all.
+        option: by which the key is set.
         hint: of an option that is still read where it was, but hidden: what to use.
     """
 
     takes: bool = True
     key: str = ""
     write: Value = write_text
+    option: str = "--set"
     hint: str = ""
 
 
@@ -176,20 +178,25 @@ MOVED: Mapping[str, Mapping[str, Moved]] = {
 """Old options of each verb."""
 
 
-def renew(args: Sequence[str], options: Callable[[str], Mapping[str, Any]]) -> tuple[list[str], str | None]:
+def renew(
+    args: Sequence[str],
+    options: Callable[[str], Mapping[str, Any]],
+    tables: Mapping[str, Mapping[str, Moved]] = MOVED,
+) -> tuple[list[str], str | None]:
     """Return the words of a command line in its new spelling, and the line that names it; None if nothing is old.
 
     Args:
         args: words after `evermap`.
         options: returns those that a verb has now, by name.
+        tables: old options of each verb.
 
     Raises:
         ConfigError: the old command line was a mistake of the user.
     """
-    verb = next((" ".join(args[:n]) for n in (1, 2) if " ".join(args[:n]) in MOVED), None)
+    verb = next((" ".join(args[:n]) for n in (1, 2) if " ".join(args[:n]) in tables), None)
     if verb is None:
         return list(args), None
-    moved = MOVED[verb]
+    moved = tables[verb]
     takes = {name: not one.is_flag for name, one in options(verb).items()}
     takes |= {name: one.takes for name, one in moved.items()}
     line = _parse(tuple(verb.split()), args[len(verb.split()) :], takes)
@@ -198,7 +205,8 @@ def renew(args: Sequence[str], options: Callable[[str], Mapping[str, Any]]) -> t
     for name in [name for name, _ in line.options if name in moved and moved[name].key]:
         if line.has(name):
             value = moved[name].write(line.take(name) or "")
-            line.options.append(("--set", f"{moved[name].key}={value}"))
+            said = f"{moved[name].key}={value}" if value or moved[name].takes else moved[name].key
+            line.options.append((moved[name].option, said))
     shown = {name for name, one in options(" ".join(line.verb)).items() if not one.hidden}
     hidden = {name for name, _ in line.options if name in moved and name not in shown}
     hints = [f"{name} is now: {moved[name].hint}" for name in sorted(hidden)]
