@@ -1,4 +1,4 @@
-"""`evermap live --replay`: the map is that of `evermap slam --map`, the lines are those of `--localize`."""
+"""`evermap live MAP INPUT`: the map is that of `evermap map enter`, the lines are those of `--localize`."""
 
 from __future__ import annotations
 

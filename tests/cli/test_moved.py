@@ -137,8 +137,8 @@ NEW = {
 }
 """Old command lines and their new spelling."""
 STILL = {
-    "slam rec --start 2026-11-29": "evermap convert",
-    "slam rec --realtime": "evermap localize",
+    "slam rec --start 2026-11-29": "and convert",
+    "slam rec --realtime": "an option of evermap localize",
     "slam rec --offline-session s.zip": "evermap convert INPUT FILE.zip --format session",
     "slam rec --shift 1:1 --prior-map truth": "evermap.io.shifted",
     "map export m --out k.yaml --lifetimes l.json": "evermap map export, without --out",

@@ -1,4 +1,4 @@
-"""`evermap slam --map` from the command line: sessions into a file, localisation in it, and what is refused."""
+"""`evermap map enter` and `localize`: sessions into a file, localisation in it, and what is refused."""
 
 from __future__ import annotations
 

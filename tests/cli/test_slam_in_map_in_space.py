@@ -1,4 +1,4 @@
-"""`evermap slam --map` of recordings in space: sessions into a file, a late one too, and what is refused."""
+"""`evermap map enter` and `localize` in space: sessions into a file, a late one too, and what is refused."""
 
 from __future__ import annotations
 

@@ -134,8 +134,10 @@ MOVED: Mapping[str, Mapping[str, Moved]] = {
         "--init": Moved(),
         "--3d": _flag(),
         "--init-bag": Moved(),
-        "--start": _still("of evermap map enter, evermap localize and evermap convert"),
-        "--realtime": _still("of evermap localize and evermap live; alone it is for experiments", takes=False),
+        "--start": _still("an option of evermap map enter, localize and convert"),
+        "--realtime": _still(
+            "an option of evermap localize and live; without a map it is for experiments", takes=False
+        ),
         "--offline-session": _still("evermap convert INPUT FILE.zip --format session"),
         "--shift": _still("for experiments; evermap.io.shifted in Python"),
     },
