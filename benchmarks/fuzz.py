@@ -592,7 +592,7 @@ def _example(folder: Path, verb: str, name: str) -> bytes:
 
     path = folder / name
     if not path.is_file():
-        result = CliRunner().invoke(app, [verb, "--init", str(path)])
+        result = CliRunner().invoke(app, ["init", {"persist": "looks", "track": "detections"}[verb], str(path)])
         assert result.exit_code == 0, result.output
     lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
     return ("\n".join(lines[:40]) + "\n").encode()

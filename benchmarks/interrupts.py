@@ -29,9 +29,9 @@ from typing import Any
 
 VERBS: dict[str, list[str]] = {
     "slam": ["slam", "rec", "--out", "out/slam"],
-    "slam --map": ["slam", "later", "--map", "site.evermap", "--out", "out/living"],
-    "persist": ["persist", "looks.csv", "--out", "out/persist", "--figures", "2"],
-    "track": ["track", "detections.csv", "--range-m", "12", "--out", "out/track", "--no-scene"],
+    "map enter": ["map", "enter", "site.evermap", "later", "--out", "out/living"],
+    "persist": ["persist", "looks.csv", "--out", "out/persist", "--set", "figures=2"],
+    "track": ["track", "detections.csv", "--range-m", "12", "--out", "out/track"],
     "simulate": ["simulate", "building", "--days", "8", "--force"],
     "convert": ["convert", "rec", "converted", "--force"],
     "demo": ["demo", "--days", "2", "--out", "out/demo"],
@@ -39,7 +39,7 @@ VERBS: dict[str, list[str]] = {
     "survival fit": ["survival", "fit", "out/track/lifetimes.csv", "--out", "priors.json"],
     "map show": ["map", "show", "site.evermap", "--figure", "map.png"],
 }
-SHARES = {"slam": 8, "slam --map": 3}
+SHARES = {"slam": 8, "map enter": 3}
 """How often a verb is interrupted; 1 for the others."""
 
 
@@ -113,9 +113,9 @@ def prepare(folder: Path) -> None:
     _run(folder, ["simulate", "sessions", "--days", "2", "--patrol-s", "60"])
     shutil.copytree(folder / "sessions" / "day00_session00", folder / "rec")
     shutil.copytree(folder / "sessions" / "day01_session00", folder / "later")
-    _run(folder, ["slam", "rec", "--map", "site.evermap", "--out", "out/living"])
-    _run(folder, ["persist", "--init", "looks.csv"])
-    _run(folder, ["track", "--init", "detections.csv"])
+    _run(folder, ["map", "enter", "site.evermap", "rec", "--out", "out/living"])
+    _run(folder, ["init", "looks", "looks.csv"])
+    _run(folder, ["init", "detections", "detections.csv"])
     _run(folder, VERBS["track"])
 
 

@@ -179,7 +179,7 @@ def over_zenoh(size: int, seconds: float, *, known: bool) -> dict[str, Any]:
         where = f"tcp/127.0.0.1:{free.getsockname()[1]}"
         free.close()
         wire = Zenoh(f"listen={where}", poses)
-        command = [sys.executable, "-m", "evermap", "live", "--map", path, "--sensor", sensor, "--zenoh", where]
+        command = [sys.executable, "-m", "evermap", "live", path, "--sensor", sensor, "--zenoh", where]
         bridge = subprocess.Popen([str(part) for part in command], stdout=subprocess.DEVNULL)
         _wait_until_idle(bridge.pid)
         used_s, start, memory = _used_s(bridge.pid), time.perf_counter(), []

@@ -109,10 +109,10 @@ def _persist(in_parts: bool, rows: int) -> dict[str, float]:
             detected = rng.random(size) < np.where(there, 0.9, 0.1)
             table = pa.table({"stamp_s": stamp_s, "feature_id": who, "detected": detected.astype(np.int8)})
             pq.write_table(table, looks / f"{number:04}.parquet")
-        CliRunner().invoke(app, ["persist", "--init", str(Path(folder) / "small.csv")])
+        CliRunner().invoke(app, ["init", "looks", str(Path(folder) / "small.csv")])
         CliRunner().invoke(app, ["persist", str(Path(folder) / "small.csv"), "--out", str(out)])
         before_mb, before = peak_mb(), os.times()
-        words = ["persist", str(looks), "--out", str(out), "--figures", "2"]
+        words = ["persist", str(looks), "--out", str(out), "--set", "figures=2"]
         words += ["--set", f"persist.rows_at_once={_PART_ROWS if in_parts else rows}"]
         assert CliRunner().invoke(app, words).exit_code == 0
         after = os.times()

@@ -3,7 +3,7 @@
     python -m benchmarks.session_path           # modules, functions, depth, maps made
     python -m benchmarks.session_path --list    # and the functions by module, in order of first entry; deepest stack
 
-Two patrols of a simulated building go through `evermap slam --map`; the second one is traced. Imports on the way are
+Two patrols of a simulated building go through `evermap map enter`; the second one is traced. Imports on the way are
 not counted, nor are comprehensions, lambdas, bodies of classes and generated methods, which are no steps of their own,
 nor compiled kernels, into which a debugger does not step.
 """
@@ -115,7 +115,7 @@ def second_session(folder: Path) -> CodePath:
         em.write_native(recording, written[-1])
 
     def slam(recording: Path) -> None:
-        words = ["slam", str(recording), "--map", str(folder / "map.evermap"), "--out", f"{recording}-out"]
+        words = ["map", "enter", str(folder / "map.evermap"), str(recording), "--out", f"{recording}-out"]
         for text in OVERRIDES:
             words += ["--set", text]
         said = StringIO()

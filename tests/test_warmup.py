@@ -69,6 +69,9 @@ print(*sorted((at_end or ready()) - at_start), sep="\\n")
 """
 
 
+NAMELESS = ("--set", "unknown_ids=true")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sessions in a building, a map of the first, and the examples of the other verbs."""
@@ -79,11 +82,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for patrol, name in zip(story_of(0, 2).patrols, ("flight", "again"), strict=True):
         write_native(patrol.recording, folder / name)
     for command in (
-        ("slam", folder / "one", "--map", folder / "first.evermap", "--out", folder / "out"),
-        ("slam", folder / "flight", "--map", folder / "space.evermap", "--unknown-ids", "--out", folder / "space"),
-        ("slam", folder / "flight", "--map", folder / "named.evermap", "--out", folder / "named"),
-        ("track", "--init", folder / "detections.csv"),
-        ("persist", "--init", folder / "looks.csv"),
+        ("map", "enter", folder / "first.evermap", folder / "one", "--out", folder / "out"),
+        (
+            "map",
+            "enter",
+            folder / "space.evermap",
+            folder / "flight",
+            "--set",
+            "unknown_ids=true",
+            "--out",
+            folder / "space",
+        ),
+        ("map", "enter", folder / "named.evermap", folder / "flight", "--out", folder / "named"),
+        ("init", "detections", folder / "detections.csv"),
+        ("init", "looks", folder / "looks.csv"),
     ):
         assert CliRunner().invoke(app, list(map(str, command))).exit_code == 0
     return folder
@@ -94,14 +106,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         "slam one",
         "slam one --unknown-ids",
-        "slam one --map new.evermap",
-        "slam one --map nameless.evermap --unknown-ids",
-        "slam two --map first.evermap",
-        "slam two --map first.evermap --localize",
+        "map enter new.evermap one",
+        "map enter nameless.evermap one --set unknown_ids=true",
+        "map enter first.evermap two",
+        "localize first.evermap two",
         "slam flight --unknown-ids",
-        "slam flight --map flights.evermap",
-        "slam again --map named.evermap",
-        "slam again --map space.evermap --unknown-ids",
+        "map enter flights.evermap flight",
+        "map enter named.evermap again",
+        "map enter space.evermap again --set unknown_ids=true",
         "track detections.csv --range-m 12",
         "persist looks.csv",
     ],

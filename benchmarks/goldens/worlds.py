@@ -195,7 +195,7 @@ def demo(_: Path) -> Iterator[Named]:
 
 
 def template(*, in_space: bool) -> Part:
-    """Return the part of the recording that `evermap slam --init` writes, beside its own map where it has one."""
+    """Return the part of the recording that `evermap init` writes, beside its own map where it has one."""
 
     def run(_: Path) -> Iterator[Named]:
         from evermap.io import write_template

@@ -68,7 +68,7 @@ def test_mistakes_are_one_line(place: Path, tmp_path: Path) -> None:
 
 def test_maps_are_exported_in_formats_of_others(place: Path) -> None:
     write_template(place / "flight", in_space=True)
-    assert run("slam", place / "flight", "--map", place / "site.evermap", "--out", place / "flown").exit_code == 0
+    assert run("map", "enter", place / "site.evermap", place / "flight", "--out", place / "flown").exit_code == 0
     for kind in MAP_FORMATS:
         out = place / f"map{kind.ending}"
         done = run("map", "export", place / "site.evermap", "--out", out, "--format", kind.name)
@@ -84,7 +84,7 @@ def test_maps_are_exported_in_formats_of_others(place: Path) -> None:
 
 def test_a_survey_that_begins_a_map_is_not_corrected_in_silence(place: Path) -> None:
     survey, out = place / "rec" / "survey.csv", place / "begun"
-    done = run("slam", place / "rec", "--map", place / "begun.evermap", "--prior-map", survey, "--out", out)
+    done = run("map", "enter", place / "begun.evermap", place / "rec", "--prior-map", survey, "--out", out)
     assert done.exit_code == 0, done.output
     mapped = json.loads(run("map", "show", place / "begun.evermap", "--json").stdout)["landmarks"]
     at = {item["landmark"]: (item["x_m"], item["y_m"]) for item in mapped}
@@ -100,12 +100,12 @@ def test_a_survey_that_begins_a_map_is_not_corrected_in_silence(place: Path) -> 
 
 def test_a_map_of_other_landmarks_is_not_used_in_silence(place: Path, tmp_path: Path) -> None:
     (tmp_path / "other.csv").write_text("id,x,y\n7001,0,0\n7002,1,0\n")
-    given = ("slam", place / "rec", "--out", tmp_path / "out", "--prior-map", tmp_path / "other.csv")
-    alone = run(*given, "--json")
+    given = (place / "rec", "--out", tmp_path / "out", "--prior-map", tmp_path / "other.csv")
+    alone = run("slam", *given, "--json")
     assert alone.exit_code == 3, alone.output  # a result that can't be trusted: the map is another
     said = [text for text in json.loads(alone.stdout)["warnings"] if "no landmark of the map was ever seen" in text]
     assert len(said) == 1
-    begun = run(*given, "--map", tmp_path / "new.evermap")
+    begun = run("map", "enter", tmp_path / "new.evermap", *given)
     assert begun.exit_code == 2
     assert "no landmark of the map was ever seen: the map has 7001, 7002, the recording has 1, 2" in begun.stderr
     assert not (tmp_path / "new.evermap").exists()

@@ -309,11 +309,11 @@ def of_looks() -> Iterator[Case]:
         spoil = both(column(file, "p_miss", lambda _, p=rates[0]: p), column(file, "p_false", lambda _, p=rates[1]: p))
         yield Case("persist", f"inverted {rates}", spoil, 2, "looks.csv:2: field 'p_miss': .* make 1 or more")
         yield Case(
-            f"persist --p-miss {rates[0]} --p-false {rates[1]}",
+            f"persist --set p_miss={rates[0]} --set p_false={rates[1]}",
             f"inverted by option {rates}",
             lambda _: None,
             2,
-            "field '--p-miss': .* make 1 or more",
+            "field 'p_miss': .* make 1 or more",
         )
     for cell in ("2", "yes", "-1", "0.5", "x"):
         yield Case(
@@ -341,18 +341,18 @@ def of_looks() -> Iterator[Case]:
         "persist", "not even a date", column(file, "stamp_s", lambda _: "2026-02-30T00:00"), 2, "is not a number"
     )
     for option, words in (
-        ("--p-miss 2", "--p-miss.*less than or equal to 1"),
-        ("--p-false nan", "--p-false.*finite"),
-        ("--confidence 0.3", "--confidence.*greater than 0.5"),
-        ("--step-s -1", "--step-s.*greater than 0"),
-        ("--horizon soon", "--horizon"),
+        ("--set p_miss=2", "p_miss.*less than or equal to 1"),
+        ("--set p_false=nan", "p_false.*finite"),
+        ("--set confidence=0.3", "confidence.*greater than 0.5"),
+        ("--set step_s=-1", "step_s.*greater than 0"),
+        ("--set horizon_s=soon", "horizon_s"),
         ("--prior exponentiel:mean=1d", "expon"),
         ("--prior exponential:mean=-1d", "prior|mean"),
-        ("--query sometimes", "query"),
-        ("--learn-from 1", "--learn-from.*greater than or equal to 2"),
-        ("--recurrent perhaps", "--recurrent.*perhaps"),
-        ("--figures -1", "figures"),
-        ("--step-s 1e-9 --query grid", "instants"),
+        ("--set query=sometimes", "query"),
+        ("--set learn_from=1", "learn_from.*greater than or equal to 2"),
+        ("--set recurrent=perhaps", "recurrent.*perhaps"),
+        ("--set figures=-1", "figures"),
+        ("--set step_s=1e-9 --set query=grid", "instants"),
         ("--model nowhere.json", "nowhere.json"),
         ("--truth nowhere.csv", "no such file"),
         ("--clock sundial", "clock"),

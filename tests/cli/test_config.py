@@ -256,7 +256,7 @@ def test_sensor_section_corrects_only_what_it_sets() -> None:
 
 
 def test_command_line_shows_the_configuration_in_force() -> None:
-    result = CliRunner().invoke(app, ["slam", "--show-config", "--sensor-model", "plain", "--set", "slam.seed=7"])
+    result = CliRunner().invoke(app, ["slam", "--show-config", "--set", "sensor_model=plain", "--set", "slam.seed=7"])
     assert result.exit_code == 0
     shown = tomllib.loads(result.stdout)["slam"]
     assert (shown["sensor_model"], shown["seed"]) == ("plain", 7)

@@ -13,15 +13,17 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 
 VERBS = [
-    "demo", "simulate", "check", "info", "slam", "audit", "live", "persist", "track", "view", "convert", "work",
-    "learn", "bench",
+    "demo", "simulate", "init", "check", "info", "slam", "localize", "together", "audit", "live", "play", "persist",
+    "track", "view", "convert", "work", "learn", "bench",
 ]  # fmt: skip
 GROUPS = {
     "map": [
         "log",
         "show",
         "diff",
+        "enter",
         "export",
+        "nav2",
         "why",
         "verify",
         "gc",
@@ -97,11 +99,11 @@ def test_interrupt_says_what_was_kept_and_130(
         (["slm"], "'slam'"),
         (["slam", "--nope"], "--nope"),
         (["slam", "--robot", "one"], "--robot"),
-        (["slam", "--sensor-model", "magic"], "calibrated"),
+        (["slam", "--set", "sensor_model=magic"], "calibrated"),
         (["convert", "only-one"], "OUT"),
         (["reproduce", "rosen1999"], "rosen2016"),
         (["slam"], "INPUT"),
-        (["slam", "--init", "--3d"], "--init DIR --3d"),
+        (["init", "rosbag", "x"], "flight"),
         (["slam", "--set", "slam.sed=1", "x"], "slam.seed"),
         (["slam", "--config", "no-such.toml", "x"], "no-such.toml"),
         (["slam", "no/such/recording"], "no/such/recording"),
@@ -116,7 +118,7 @@ def test_wrong_command_line_is_one_line_and_2(arguments: list[str], named: str) 
 
 def test_results_never_mix_with_what_is_there(tmp_path: Any) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    for arguments in (["demo", "--out"], ["simulate"], ["slam", "x", "--out"], ["convert", "x"], ["slam", "--init"]):
+    for arguments in (["demo", "--out"], ["simulate"], ["slam", "x", "--out"], ["convert", "x"], ["init", "flight"]):
         line = assert_one_line(run(*arguments, str(tmp_path)), 2)
         assert str(tmp_path) in line
     for arguments in (["demo", "--out"], ["simulate"], ["slam", "x", "--out"]):

@@ -29,11 +29,11 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_template(folder / "rec")
     write_template(folder / "flight", in_space=True)
     for arguments in (
-        ("slam", folder / "rec", "--map", folder / "site.evermap", "--out", folder / "run"),
+        ("map", "enter", folder / "site.evermap", folder / "rec", "--out", folder / "run"),
         ("slam", folder / "flight", "--out", folder / "flown", "--set", "output.mcap=true", *QUICK),
         ("map", "export", folder / "site.evermap", "--out", folder / "map.geojson", "--lifetimes", folder / "l.json"),
-        ("persist", "--init", folder / "looks.csv"),
-        ("track", "--init", folder / "detections.csv"),
+        ("init", "looks", folder / "looks.csv"),
+        ("init", "detections", folder / "detections.csv"),
     ):
         done = run(*arguments)
         assert done.exit_code == 0, done.output

@@ -41,6 +41,10 @@ def errors() -> tuple[str, ...]:
     return ("--p-miss", str(P_ERROR), "--p-false", str(P_ERROR))
 
 
+def keys() -> tuple[str, ...]:
+    return ("--set", f"p_miss={P_ERROR}", "--set", f"p_false={P_ERROR}")
+
+
 @pytest.fixture(scope="module")
 def model(table: Path) -> Path:
     """What is learned of both."""
@@ -65,7 +69,7 @@ def test_rates_of_a_cart_and_of_a_wall(model: Path) -> None:
 
 def test_persist_uses_the_model_of_each_class(table: Path, model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    result = run("persist", table, "--model", model, *errors(), "--out", out, "--figures", "0")
+    result = run("persist", table, "--set", f"model={model}", *keys(), "--out", out, "--set", "figures=0")
     assert result.exit_code == 0, result.stderr
     rows = np.genfromtxt(table, delimiter=",", names=True, dtype=None, encoding="utf-8")
     beliefs = np.genfromtxt(out / "beliefs.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
@@ -111,7 +115,7 @@ def test_wrong_choices_are_one_line_and_write_nothing(
 def test_a_model_that_lacks_a_feature_says_which(model: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.csv"
     other.write_text("stamp_s,feature_id,class_id,detected\n0,tree,plant,1\n1,tree,plant,1\n")
-    result = run("persist", other, "--model", model, "--out", tmp_path / "out")
+    result = run("persist", other, "--set", f"model={model}", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "feature 'tree' of class 'plant'" in result.stderr
 

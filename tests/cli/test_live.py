@@ -1,4 +1,4 @@
-"""`evermap live --replay`: the map is that of `evermap slam --map`, the lines are those of `--localize`."""
+"""`evermap live MAP INPUT`: the map is that of `evermap map enter`, the lines are those of `--localize`."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: Path, sessions: list[Path]) -> None:
     live, slam = tmp_path / "live.evermap", tmp_path / "slam.evermap"
     for number, path in enumerate(sessions):
-        result = run("live", "--replay", path, "--map", live)
+        result = run("live", live, path)
         assert result.exit_code == 0, result.stderr
         assert f"revision {number + 1}" in result.stdout
-        assert run("slam", path, "--map", slam, "--out", tmp_path / f"out{number}", *QUICK).exit_code == 0
+        assert run("map", "enter", slam, path, "--out", tmp_path / f"out{number}", *QUICK).exit_code == 0
     with open_store(live) as one, open_store(slam) as other:
         ours, theirs = one.load(), other.load()
         assert set(one.changes(3)) == set(other.changes(3))
     np.testing.assert_array_equal(ours.landmarks().position_m, theirs.landmarks().position_m)
     np.testing.assert_array_equal(ours.landmarks().p_exists, theirs.landmarks().p_exists)
 
-    result = run("live", "--replay", sessions[2], "--map", live, "--localize", "--json")
+    result = run("live", live, sessions[2], "--localize", "--json")
     assert result.exit_code == 0, result.stderr
     lines = [json.loads(line) for line in result.stdout.splitlines()]
     poses = [line for line in lines if "x_m" in line]
@@ -64,28 +64,27 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--replay", "none", "--map", "m.evermap"], "none"),
-        (["--replay", "{0}", "--map", "m.evermap", "--localize"], "no such"),
-        (["--replay", "{0}", "--map", "m.evermap", "--set", "live.reorder=1"], "live.reorder_s"),
-        (["--replay", "{0}", "--map", "m.evermap", "--set", "reorder_s=-1"], "live.reorder_s"),
-        (["--replay", "{0}"], "--map"),
-        (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--localize"], "'--localize': needs a map"),
-        (["--replay", "{0}", "--zenoh", "tcp/localhost:7447", "--set", "reorder_s=1"], "'--set': needs a map"),
-        (["--map", "m.evermap", "--foxglove", "0", "--robot", "1"], "'--robot': is for a replay"),
-        (["--map", "m.evermap", "--foxglove", "0", "--realtime"], "'--realtime': is for a replay"),
-        (["--map", "m.evermap"], "no robot (try: --zenoh tcp/localhost:7447"),
-        (["--zenoh", "tcp/localhost:7447"], "a living map is needed"),
-        (["--map", "m.evermap", "--zenoh", "tcp/localhost:7447"], "--sensor sensor.toml"),
-        (["--map", "m.evermap", "--zenoh", "nonsense", "--sensor", "{0}/sensor.toml"], "--zenoh"),
-        (["--map", "m.evermap", "--zenoh", "z.json5", "--sensor", "{0}/sensor.toml"], "z.json5: 1:"),
-        (["--map", "m.evermap", "--zenoh", "none.json5", "--sensor", "{0}/sensor.toml"], "none.json5: No such file"),
-        (["--replay", "{0}", "--map", "m.evermap", "--sensor", "none.toml"], "omit --sensor"),
-        (["--replay", "{0}", "--map", "m.evermap", "--topics", "none.toml"], "omit --topics"),
-        (["--replay", "{0}", "--map", "z.json5"], "z.json5: is not an evermap map"),
-        (["--map", "m.evermap", "--foxglove", "nonsense", "--sensor", "{0}/sensor.toml"], "no server at nonsense"),
-        (["--map", "m.evermap", "--foxglove", "0", "--sensor", "none.toml"], "none.toml"),
+        (["live", "m.evermap", "none"], "none"),
+        (["live", "m.evermap", "{0}", "--localize"], "no such"),
+        (["live", "m.evermap", "{0}", "--set", "live.reorder=1"], "live.reorder_s"),
+        (["live", "m.evermap", "{0}", "--set", "reorder_s=-1"], "live.reorder_s"),
+        (["live"], "MAP"),
+        (["play"], "INPUT"),
+        (["play", "{0}"], "no connection (try: --zenoh tcp/localhost:7447"),
+        (["live", "m.evermap", "--foxglove", "0", "--robot", "1"], "'--robot': is for a replay"),
+        (["live", "m.evermap", "--foxglove", "0", "--realtime"], "'--realtime': is for a replay"),
+        (["live", "m.evermap"], "no robot (try: --zenoh tcp/localhost:7447"),
+        (["live", "m.evermap", "--zenoh", "tcp/localhost:7447"], "--sensor sensor.toml"),
+        (["live", "m.evermap", "--zenoh", "nonsense", "--sensor", "{0}/sensor.toml"], "--zenoh"),
+        (["live", "m.evermap", "--zenoh", "z.json5", "--sensor", "{0}/sensor.toml"], "z.json5: 1:"),
+        (["live", "m.evermap", "--zenoh", "none.json5", "--sensor", "{0}/sensor.toml"], "none.json5: No such file"),
+        (["live", "m.evermap", "{0}", "--sensor", "none.toml"], "omit --sensor"),
+        (["live", "m.evermap", "{0}", "--topics", "none.toml"], "omit --topics"),
+        (["live", "z.json5", "{0}"], "z.json5: is not an evermap map"),
+        (["live", "m.evermap", "--foxglove", "nonsense", "--sensor", "{0}/sensor.toml"], "no server at nonsense"),
+        (["live", "m.evermap", "--foxglove", "0", "--sensor", "none.toml"], "none.toml"),
         (
-            ["--map", "m.evermap", "--foxglove", "0", "--sensor", "{0}/sensor.toml", "--topics", "none.toml"],
+            ["live", "m.evermap", "--foxglove", "0", "--sensor", "{0}/sensor.toml", "--topics", "none.toml"],
             "none.toml",
         ),
     ],
@@ -95,14 +94,14 @@ def test_mistakes_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("z.json5").write_text("{ junk", encoding="utf-8")
-    result = run("live", *(argument.format(*sessions) for argument in arguments))
+    result = run(*(argument.format(*sessions) for argument in arguments))
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
     assert told in result.stderr
     assert not Path("z.json5.live").exists()
 
 
-@pytest.mark.parametrize("others", [["--map", "m.evermap"], ["--zenoh", "tcp/localhost:7447"]])
+@pytest.mark.parametrize("others", [["live", "m.evermap", "uwb"], ["play", "uwb", "--zenoh", "tcp/localhost:7447"]])
 def test_ranges_without_bearings_are_refused(
     others: list[str], sessions: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,17 +111,17 @@ def test_ranges_without_bearings_are_refused(
     unsaid = np.full(len(recording.detections), np.nan)
     seen = replace(recording.detections, bearing_rad=unsaid, sigma_bearing_rad=unsaid)
     write_native(replace(recording, detections=seen), tmp_path / "uwb")
-    result = run("live", "--replay", "uwb", *others)
+    result = run(*others)
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
-    assert "'--replay': " in result.stderr
+    assert "INPUT" in result.stderr
     assert "has ranges without bearings, which are located by what is seen later" in result.stderr
-    assert "(try: evermap slam --map)" in result.stderr
+    assert "(try: evermap map enter)" in result.stderr
     assert not Path("m.evermap").exists()
 
 
 def started(*arguments: str | Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "evermap", "live", *map(str, arguments)]
+    command = [sys.executable, "-m", "evermap", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -136,9 +135,9 @@ def test_a_robot_over_zenoh_and_the_end_of_the_bridge(tmp_path: Path, sessions: 
         where = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     path = tmp_path / "site.evermap"
     for session in sessions[:2]:
-        assert run("live", "--replay", session, "--map", path).exit_code == 0
-    bridge = started("--map", path, "--sensor", sessions[2] / "sensor.toml", "--zenoh", f"listen={where}", "--json")
-    robot = started("--replay", sessions[2], "--zenoh", where)
+        assert run("live", path, session).exit_code == 0
+    bridge = started("live", path, "--sensor", sessions[2] / "sensor.toml", "--zenoh", f"listen={where}", "--json")
+    robot = started("play", sessions[2], "--zenoh", where)
     assert bridge.stdout is not None
     told = [json.loads(bridge.stdout.readline()) for _ in range(110)]
     last_s = max(line["stamp_s"] for line in told if "stamp_s" in line)

@@ -97,7 +97,7 @@ def site(building: Path) -> Path:
     from evermap.maps.store import Provenance, open_store
 
     path = building.parent / "site.evermap"
-    run("slam", building / "day00_session00", "--map", path, "--out", building.parent / "out")
+    run("map", "enter", path, building / "day00_session00", "--out", building.parent / "out")
     with open_store(path) as store:
         living = store.load()
         count = len(living.members)
@@ -144,7 +144,7 @@ def test_why_and_diff_of_a_map(site: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_objects_and_their_lifetimes(tmp_path: Path) -> None:
     table = tmp_path / "detections.csv"
-    run("track", "--init", table)
+    run("init", "detections", table)
     renamed(table, "class_id", sorted(set(columns(table)["class_id"])), NAMES)
     assert on_a_terminal("track", table, "--range-m", "12", "--out", tmp_path / "out")
     lifetimes = tmp_path / "out" / "lifetimes.csv"
@@ -155,7 +155,7 @@ def test_objects_and_their_lifetimes(tmp_path: Path) -> None:
 
 def test_features_of_a_table_of_looks(tmp_path: Path) -> None:
     table = tmp_path / "looks.csv"
-    run("persist", "--init", table)
+    run("init", "looks", table)
     for column in ("feature_id", "class_id"):
         renamed(table, column, sorted(set(columns(table)[column])), NAMES)
     assert on_a_terminal("persist", table, "--out", tmp_path / "out")

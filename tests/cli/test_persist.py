@@ -32,7 +32,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The table that --init writes."""
+    """The table that `evermap init looks` writes."""
     path = tmp_path_factory.mktemp("example") / "looks.csv"
     assert run("--init", path).exit_code == 0
     return path
@@ -132,7 +132,9 @@ def test_the_report_needs_nothing_else(done: tuple[Path, dict[str, Any]]) -> Non
 def test_without_truth_there_is_no_score(tmp_path: Path) -> None:
     path = tmp_path / "looks.csv"
     path.write_text("stamp_s,feature_id,detected\n" + "".join(f"{k},3,1\n{k},10,0\n" for k in range(9)))
-    result = run(path, "--out", tmp_path / "out", "--json", "--figures", "1", "--query", "grid", "--step-s", "2")
+    result = run(
+        path, "--out", tmp_path / "out", "--json", "--set", "figures=1", "--set", "query=grid", "--set", "step_s=2"
+    )
     summary = json.loads(result.stdout)
     assert summary["metrics"] is None
     assert not (tmp_path / "out" / "figures" / "calibration.png").exists()
@@ -165,13 +167,13 @@ def test_ids_that_are_numbers_stay_numbers(tmp_path: Path) -> None:
 
 
 def test_a_learned_model_is_kept_and_gives_the_same_beliefs_again(example: Path, tmp_path: Path) -> None:
-    learned = run(example, "--recurrent", "two-state", "--out", tmp_path / "one", "--json", "--figures", "0")
+    learned = run(example, "--set", "recurrent=two-state", "--out", tmp_path / "one", "--json", "--set", "figures=0")
     summary = json.loads(learned.stdout)
     assert summary["learning"]["per"] == "class"
     assert {model["kind"] for model in summary["learning"]["models"].values()} == {"two-state"}
     assert not summary["counts"]["rows"] - summary["counts"]["beliefs"]
     model = tmp_path / "one" / "model.json"
-    again = run(example, "--model", model, "--out", tmp_path / "two", "--json", "--figures", "0")
+    again = run(example, "--set", f"model={model}", "--out", tmp_path / "two", "--json", "--set", "figures=0")
     assert json.loads(again.stdout)["learning"] is None
     first, second = (rows_of(tmp_path / name / "beliefs.csv") for name in ("one", "two"))
     for a, b in zip(first, second, strict=True):
@@ -194,16 +196,19 @@ def broken(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (lambda path: [], "field 'INPUT': a table is needed (try: --init looks.csv"),
+        (lambda path: [], "field 'INPUT': a table is needed (try: evermap init looks looks.csv"),
         (lambda path: [path.parent / "none.csv"], "none.csv: no such file"),
         (lambda path: [broken(path.parent)], "looks.csv:3: field 'detected': '5' is neither 1 nor 0"),
         (lambda path: [path, "--prior", "exponential:half-life=2"], "field '--prior': prior 'exponential:half-life=2'"),
         (lambda path: [path, "--prior", "carts=never-leaves"], "field '--prior': no feature is of class 'carts'"),
-        (lambda path: [path, "--horizon", "3"], "field '--horizon': '3' has no unit"),
-        (lambda path: [path, "--recurrent", "often"], "field '--recurrent': unknown kind of model 'often'"),
-        (lambda path: [path, "--p-miss", "1.2"], "field '--p-miss': input should be less than or equal to 1, not 1.2"),
+        (lambda path: [path, "--set", "horizon_s=3h"], "field 'persist.horizon_s': input should be a valid number"),
+        (lambda path: [path, "--set", "recurrent=often"], "field 'recurrent': unknown kind of model 'often'"),
         (
-            lambda path: [path, "--model", "m.json", "--prior", "never-leaves"],
+            lambda path: [path, "--set", "p_miss=1.2"],
+            "field 'persist.p_miss': input should be less than or equal to 1, not 1.2",
+        ),
+        (
+            lambda path: [path, "--set", "model=m.json", "--prior", "never-leaves"],
             "field '--prior': a lifetime prior is for",
         ),
         (lambda path: ["--init", path], "looks.csv: exists already (try: another name)"),
@@ -222,16 +227,16 @@ def test_a_folder_that_is_not_ours_is_left_alone(example: Path, tmp_path: Path) 
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("precious")
     assert "contains 'thesis.tex', which no evermap run wrote" in refuse(run(example, "--out", tmp_path / "out"))
-    assert run(example, "--out", tmp_path / "out", "--force", "--figures", "0").exit_code == 0
-    refuse(run(example, "--out", tmp_path / "out", "--figures", "0"))
-    assert run(example, "--out", tmp_path / "out", "--figures", "0", "--force").exit_code == 0
+    assert run(example, "--out", tmp_path / "out", "--force", "--set", "figures=0").exit_code == 0
+    refuse(run(example, "--out", tmp_path / "out", "--set", "figures=0"))
+    assert run(example, "--out", tmp_path / "out", "--set", "figures=0", "--force").exit_code == 0
     assert (tmp_path / "out" / "thesis.tex").read_text() == "precious"
 
 
 @pytest.mark.data
 def test_a_real_recording_scores_as_its_truth_says(shared_data: Path, tmp_path: Path) -> None:
     path = shared_data / "presence" / "room_test.csv.gz"
-    result = run(path, "--out", tmp_path / "out", "--json", "--figures", "0")
+    result = run(path, "--out", tmp_path / "out", "--json", "--set", "figures=0")
     summary = json.loads(result.stdout)
     assert summary["counts"]["rows"] == 172_800
     assert summary["counts"]["features"] == 8

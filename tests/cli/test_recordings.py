@@ -95,7 +95,7 @@ def test_a_street_is_written_with_who_stood_where(tmp_path: Path) -> None:
         there = (spans[:, 0] <= recording.frames.stamp_s[0]) & (spans[:, 1] > recording.frames.stamp_s[-1])
         off = np.linalg.norm(at[:, None] - places[None, there], axis=2).min(axis=0)
         assert off.max() < 0.6  # a parked car is detected at its slot
-    assert run("simulate", "street", tmp_path / "no", "--doors").exit_code == 2
+    assert run("simulate", "street", tmp_path / "no", "--with", "doors").exit_code == 2
     assert run("simulate", "stret", tmp_path / "no").exit_code == 2
 
 
@@ -112,12 +112,13 @@ def test_a_yard_is_written_with_its_bodies(tmp_path: Path) -> None:
     assert set(recording.objects[:, 1].tolist()) == {0, 1, 2, 3, 4, 5}
     np.testing.assert_array_equal(unpack_recording(pack_recording(recording)).objects, recording.objects)
     standing = tmp_path / "standing"
-    assert run("simulate", "yard", standing, "--days", "1", "--moving", "3", "--seed", "2", "--standing").exit_code == 0
+    same = ("--days", "1", "--moving", "3", "--seed", "2")
+    assert run("simulate", "yard", standing, *same, "--with", "standing").exit_code == 0
     with (standing / "bodies_truth.csv").open(encoding="utf-8", newline="") as file:
         places = {(row["object_id"], row["x_m"], row["y_m"]) for row in csv.DictReader(file)}
     assert len(places) == 6
     flat = tmp_path / "plane"
-    assert run("simulate", "yard", flat, "--days", "1", "--moving", "3", "--seed", "2", "--plane").exit_code == 0
+    assert run("simulate", "yard", flat, *same, "--with", "plane").exit_code == 0
     seen = read_recording(flat / "day00_session00")
     assert isinstance(seen, Recording)
     assert (flat / "bodies_truth.csv").read_text("utf-8") == (out / "bodies_truth.csv").read_text("utf-8")
@@ -129,8 +130,8 @@ def test_a_yard_is_written_with_its_bodies(tmp_path: Path) -> None:
     for name in np.unique(seen.detections.landmark_id[on_walls]):
         assert np.ptp(at[seen.detections.landmark_id == name], axis=0).max() < 2.0
     assert run("simulate", "street", tmp_path / "no", "--plane").exit_code == 2
-    assert run("simulate", "street", tmp_path / "no", "--standing").exit_code == 2
-    assert run("simulate", "yard", tmp_path / "no", "--doors").exit_code == 2
+    assert run("simulate", "street", tmp_path / "no", "--with", "standing").exit_code == 2
+    assert run("simulate", "yard", tmp_path / "no", "--with", "doors").exit_code == 2
 
 
 @pytest.mark.parametrize("table_format", ["csv", "parquet"])
@@ -161,7 +162,7 @@ def test_convert_of_a_public_recording(shared_data: Path, tmp_path: Path) -> Non
 def test_a_building_of_partial_views_says_what_was_looked_at(tmp_path: Path) -> None:
     """The options reach the simulation, and the table is its truth."""
     lengths = ["--patrol-s", "20", "--patrol-s", "30"]
-    hard = ["--doors", "--wing-opens-day", "2", "--clutter", "--days", "3", "--seed", "2"]
+    hard = ["--wing-opens-day", "2", "--with", "doors", "--with", "clutter", "--days", "3", "--seed", "2"]
     assert run("simulate", tmp_path / "hard", *lengths, *hard).exit_code == 0
     config = BuildingConfig(
         days=3, patrol_s=30.0, patrol_lengths_s=(20.0, 30.0), doors=ROOM_DOORS, wing_opens_day=2,

@@ -1,4 +1,4 @@
-"""`evermap slam --map` from the command line: sessions into a file, localisation in it, and what is refused."""
+"""`evermap map enter` and `localize`: sessions into a file, localisation in it, and what is refused."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import tomllib
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,12 @@ def run(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def slam(recording: Path, map_file: Path, out: Path, *more: str | Path) -> Result:
-    return run("slam", recording, "--map", map_file, "--out", out, "--json", *more, *KNOWN_METRE, *QUICK)
+def enter(recording: Path, map_file: Path, out: Path, *more: str | Path) -> Result:
+    return run("map", "enter", map_file, recording, "--out", out, "--json", *more, *KNOWN_METRE, *QUICK)
+
+
+def localize(recording: Path, map_file: Path, out: Path, *more: str | Path) -> Result:
+    return run("localize", map_file, recording, "--out", out, "--json", *more, *KNOWN_METRE, *QUICK)
 
 
 def digest(path: Path) -> str:
@@ -81,7 +86,7 @@ def kept(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tu
     folder = tmp_path_factory.mktemp("kept")
     printed = []
     for day in (0, 1):
-        result = slam(recordings[day], folder / "building.evermap", folder / f"day{day}")
+        result = enter(recordings[day], folder / "building.evermap", folder / f"day{day}")
         assert result.exit_code == 0, result.stderr
         printed.append(json.loads(result.stdout))
     return folder / "building.evermap", printed
@@ -133,7 +138,7 @@ def test_localising_finds_the_robot_and_leaves_the_map(
     copy: Path, recordings: list[Path], building: BuildingSimulation, tmp_path: Path
 ) -> None:
     before = digest(copy)
-    result = slam(recordings[2], copy, tmp_path / "run", "--localize")
+    result = localize(recordings[2], copy, tmp_path / "run")
     assert result.exit_code == 0, result.stderr
     assert digest(copy) == before
     path = read_tum(tmp_path / "run" / "trajectory.tum")
@@ -156,7 +161,7 @@ def test_localising_finds_the_robot_and_leaves_the_map(
 def test_the_next_session_goes_into_the_same_map(copy: Path, recordings: list[Path], tmp_path: Path) -> None:
     with open_store(copy) as store:
         before = store.load(store.head())
-    result = slam(recordings[2], copy, tmp_path / "run")
+    result = enter(recordings[2], copy, tmp_path / "run")
     assert result.exit_code == 0, result.stderr
     with open_store(copy) as store:
         after = store.load(store.head())
@@ -170,9 +175,6 @@ def test_the_next_session_goes_into_the_same_map(copy: Path, recordings: list[Pa
     ("more", "problem"),
     [
         (["--prior-map", "truth"], "--prior-map"),
-        (["--method", "viterbi"], "--method"),
-        (["--realtime"], "--realtime"),
-        (["--unknown-ids", "--localize"], "is not causal"),
         (["--set", "living.search=guess"], "living.search"),
     ],
 )
@@ -180,7 +182,9 @@ def test_options_that_contradict_a_map(
     more: list[str], problem: str, copy: Path, recordings: list[Path], tmp_path: Path
 ) -> None:
     before = digest(copy)
-    assert problem in one_line(slam(recordings[2], copy, tmp_path / "run", *more))
+    assert problem in one_line(enter(recordings[2], copy, tmp_path / "run", *more))
+    causal = localize(recordings[2], copy, tmp_path / "run", "--set", "unknown_ids=true")
+    assert "is not causal" in one_line(causal)
     assert digest(copy) == before
     assert not (tmp_path / "run").exists()
 
@@ -188,10 +192,10 @@ def test_options_that_contradict_a_map(
 def test_a_session_that_is_in_the_map_is_refused(copy: Path, recordings: list[Path], tmp_path: Path) -> None:
     """It would be counted twice; localising in the map by it leaves the map as it is."""
     before = digest(copy)
-    problem = one_line(slam(recordings[0], copy, tmp_path / "run"))
+    problem = one_line(enter(recordings[0], copy, tmp_path / "run"))
     assert "is in the map already, as revision 1" in problem
     assert not (tmp_path / "run").exists()
-    result = slam(recordings[0], copy, tmp_path / "run", "--localize")
+    result = localize(recordings[0], copy, tmp_path / "run")
     assert result.exit_code == 0, result.stderr
     assert digest(copy) == before
 
@@ -201,8 +205,8 @@ def test_several_sessions_in_one_call(
 ) -> None:
     """One that cannot be read stops none of the others; each has its folder; the map is that of single calls."""
     map_file, out = tmp_path / "building.evermap", tmp_path / "week"
-    given = (recordings[0], tmp_path / "nothing", recordings[1], "--map", map_file, "--out", out)
-    result = run("slam", *given, *KNOWN_METRE, *QUICK)
+    given = (map_file, recordings[0], tmp_path / "nothing", recordings[1], "--out", out)
+    result = run("map", "enter", *given, *KNOWN_METRE, *QUICK)
     assert result.exit_code == 2
     assert "nothing: no such file or folder" in result.stderr
     assert "1 of 3 sessions were refused" in result.stderr
@@ -211,7 +215,7 @@ def test_several_sessions_in_one_call(
         assert store.load(store.head()).places.position_m == pytest.approx(single.load(2).places.position_m, abs=1e-12)
     result = run("slam", recordings[0], recordings[1])
     assert result.exit_code == 2
-    assert "several recordings need a map (try: --map FILE" in result.stderr
+    assert "several recordings need a map (try: evermap map enter MAP INPUT..." in result.stderr
 
 
 def test_of_several_sessions_the_first_that_is_read_begins_with_the_survey(
@@ -221,23 +225,23 @@ def test_of_several_sessions_the_first_that_is_read_begins_with_the_survey(
     assert survey is not None
     write_map_csv(survey, tmp_path / "survey.csv")
     map_file = tmp_path / "building.evermap"
-    given = (tmp_path / "nothing", *recordings[:2], "--map", map_file, "--prior-map", tmp_path / "survey.csv")
-    result = run("slam", *given, "--out", tmp_path / "week", *KNOWN_METRE, *QUICK)
+    given = (map_file, tmp_path / "nothing", *recordings[:2], "--prior-map", tmp_path / "survey.csv")
+    result = run("map", "enter", *given, "--out", tmp_path / "week", *KNOWN_METRE, *QUICK)
     assert "1 of 3 sessions were refused" in result.stderr
     with open_store(map_file) as store:
         assert [len(store.load(number).places) >= len(survey) for number in (1, 2, 3)] == [True] * 3
 
 
-@pytest.mark.parametrize("more", [(), ("--localize",)])
+@pytest.mark.parametrize("slam", [enter, localize])
 def test_ranges_in_millimetres_leave_the_map_as_it_is(
-    copy: Path, building: BuildingSimulation, tmp_path: Path, more: tuple[str, ...]
+    copy: Path, building: BuildingSimulation, tmp_path: Path, slam: Callable[..., Result]
 ) -> None:
     """As without a map: exit code 3, and what is wrong."""
     other = building.sessions[2]
     detections = replace(other.detections, range_m=1e3 * other.detections.range_m)
     write_native(replace(other, detections=detections), tmp_path / "long")
     before = digest(copy)
-    result = slam(tmp_path / "long", copy, tmp_path / "run", *more)
+    result = slam(tmp_path / "long", copy, tmp_path / "run")
     assert result.exit_code == 3, result.output
     assert "sensor suspect: ranges seem to be in millimetres" in result.stderr.splitlines()[-1]
     assert digest(copy) == before
@@ -273,7 +277,7 @@ def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSim
     detections = replace(other.detections, landmark_id=names)
     write_native(replace(other, detections=detections, true_landmarks=None), tmp_path / "elsewhere")
     before = digest(copy)
-    result = slam(tmp_path / "elsewhere", copy, tmp_path / "run")
+    result = enter(tmp_path / "elsewhere", copy, tmp_path / "run")
     assert result.exit_code == 3
     problem = result.stderr.splitlines()[-1]
     assert "was set aside, the map is unchanged: too few of the detected landmarks" in problem
@@ -285,14 +289,14 @@ def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSim
 
 
 def test_localising_needs_a_map_with_something_in_it(recordings: list[Path], tmp_path: Path) -> None:
-    assert "--map FILE" in one_line(run("slam", recordings[0], "--out", tmp_path / "run", "--localize"))
+    assert "INPUT" in one_line(run("localize", recordings[0], "--out", tmp_path / "run"))
     missing = tmp_path / "none.evermap"
-    assert str(missing) in one_line(slam(recordings[0], missing, tmp_path / "run", "--localize"))
+    assert str(missing) in one_line(localize(recordings[0], missing, tmp_path / "run"))
     assert not missing.exists()
     empty = tmp_path / "empty.evermap"
     open_store(empty, create=True).close()
     before = digest(empty)
-    assert "empty" in one_line(slam(recordings[0], empty, tmp_path / "run", "--localize"))
+    assert "empty" in one_line(localize(recordings[0], empty, tmp_path / "run"))
     assert digest(empty) == before
     assert not (tmp_path / "run").exists()
 
@@ -301,12 +305,12 @@ def test_localising_needs_a_map_with_something_in_it(recordings: list[Path], tmp
 def test_a_file_that_is_no_map_is_left_alone(content: bytes, recordings: list[Path], tmp_path: Path) -> None:
     path = tmp_path / "something.csv"
     path.write_bytes(content)
-    for more in ((), ("--localize",)):
-        assert str(path) in one_line(slam(recordings[0], path, tmp_path / "run", *more))
+    for slam in (enter, localize):
+        assert str(path) in one_line(slam(recordings[0], path, tmp_path / "run"))
         assert path.read_bytes() == content
         assert not (tmp_path / "run").exists()
 
 
 def test_a_recording_that_cannot_be_read_makes_no_map(tmp_path: Path) -> None:
-    one_line(slam(tmp_path / "nothing", tmp_path / "new.evermap", tmp_path / "run"))
+    one_line(enter(tmp_path / "nothing", tmp_path / "new.evermap", tmp_path / "run"))
     assert not (tmp_path / "new.evermap").exists()

@@ -1,4 +1,4 @@
-"""`evermap slam --map` of recordings in space: sessions into a file, a late one too, and what is refused."""
+"""`evermap map enter` and `localize` in space: sessions into a file, a late one too, and what is refused."""
 
 from __future__ import annotations
 
@@ -68,15 +68,15 @@ def run(*arguments: str | Path | int) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def slam(*arguments: str | Path) -> dict[str, Any]:
-    result = run("slam", *arguments, "--json", *QUICK)
+def enter(*arguments: str | Path) -> dict[str, Any]:
+    result = run("map", "enter", *arguments, "--json", *QUICK)
     assert result.exit_code == 0, result.stderr
     return dict(json.loads(result.stdout))
 
 
 def refused(*arguments: str | Path) -> str:
     """What a user reads who did something wrong."""
-    result = run("slam", *arguments, *QUICK)
+    result = run(*arguments, *QUICK)
     assert result.exit_code == 2, result.output
     assert result.stderr.count("\n") == 1
     return result.stderr
@@ -85,9 +85,9 @@ def refused(*arguments: str | Path) -> str:
 @pytest.mark.slow
 def test_sessions_in_space_of_which_one_is_late(days: list[Path], tmp_path: Path) -> None:
     site, out = tmp_path / "site.evermap", tmp_path / "out"
-    first = slam(days[0], "--map", site, "--out", out)
+    first = enter(site, days[0], "--out", out)
     assert (first["counts"]["landmarks_grown"], first["changes"]) == (N_TAGS, [])
-    last = slam(days[2], "--map", site, "--out", out)
+    last = enter(site, days[2], "--out", out)
     (change,) = last["changes"]
     assert (change["landmarks"], change["kind"]) == ([3], "moved")
     np.testing.assert_allclose(change["displacement_m"], [0.0, 0.0, UP_M], atol=0.05)
@@ -96,7 +96,7 @@ def test_sessions_in_space_of_which_one_is_late(days: list[Path], tmp_path: Path
     assert mapped.position_m.shape == (N_TAGS, 3)
     assert mapped.rotation is not None
 
-    late = run("slam", days[1], "--map", site, "--out", tmp_path / "late", *QUICK)
+    late = run("map", "enter", site, days[1], "--out", tmp_path / "late", *QUICK)
     assert late.exit_code == 0, late.stderr
     assert "a late session" in late.stderr
     told = json.loads(run("map", "diff", site, 1, "--json").stdout)
@@ -113,13 +113,13 @@ def test_sessions_in_space_of_which_one_is_late(days: list[Path], tmp_path: Path
 def test_a_replay_in_space_enters_what_slam_enters(days: list[Path], tmp_path: Path) -> None:
     live, site = tmp_path / "live.evermap", tmp_path / "slam.evermap"
     for day in days[:2]:
-        assert run("live", "--replay", day, "--map", live).exit_code == 0
-        slam(day, "--map", site, "--out", tmp_path / day.name)
+        assert run("live", live, day).exit_code == 0
+        enter(site, day, "--out", tmp_path / day.name)
     with open_store(live) as one, open_store(site) as other:
         ours, theirs = one.load().landmarks(), other.load().landmarks()
     np.testing.assert_allclose(ours.position_m, theirs.position_m, atol=1e-6)
     np.testing.assert_allclose(ours.p_exists, theirs.p_exists, atol=0.02)
-    result = run("live", "--replay", days[1], "--map", live, "--localize", "--json")
+    result = run("live", live, days[1], "--localize", "--json")
     poses = [json.loads(line) for line in result.stdout.splitlines() if "qw" in line]
     assert len(poses) > 0.9 * N_FRAMES
     assert poses[-1]["frame"] == "prior_map"
@@ -127,27 +127,27 @@ def test_a_replay_in_space_enters_what_slam_enters(days: list[Path], tmp_path: P
 
 def test_what_does_not_fit_is_one_line(days: list[Path], tmp_path: Path) -> None:
     site, out = tmp_path / "site.evermap", tmp_path / "out"
-    slam(days[0], "--map", site, "--out", out)
+    enter(site, days[0], "--out", out)
     before = site.read_bytes()
-    line = refused(days[0], "--map", site, "--out", tmp_path / "again")
+    line = refused("map", "enter", site, days[0], "--out", tmp_path / "again")
     assert "is in the map already, as revision 1" in line
-    line = refused(days[1], "--map", site, "--realtime", "--out", tmp_path / "where")
+    line = refused("localize", site, days[1], "--realtime", "--out", tmp_path / "where")
     assert "solved when it ends" in line
-    assert run("slam", "--init", tmp_path / "planar").exit_code == 0
-    line = refused(tmp_path / "planar", "--map", site, "--out", tmp_path / "mixed")
+    assert run("init", "recording", tmp_path / "planar").exit_code == 0
+    line = refused("map", "enter", site, tmp_path / "planar", "--out", tmp_path / "mixed")
     assert "a recording in the plane, the map is of space" in line
     assert site.read_bytes() == before
-    found = slam(days[2], "--map", site, "--localize", "--out", tmp_path / "where")
-    assert found["changes"] == []  # as in the plane: what changed is told when the session enters the map
+    found = run("localize", site, days[2], "--out", tmp_path / "where", "--json", *QUICK)
+    assert json.loads(found.stdout)["changes"] == []  # as in the plane: they come when it enters
     assert site.read_bytes() == before
 
 
 @pytest.mark.parametrize("in_space", [False, True])
 def test_a_new_map_may_begin_with_a_survey(in_space: bool, tmp_path: Path) -> None:
     folder, file = tmp_path / "mine", tmp_path / "site.evermap"
-    assert run("slam", "--init", folder, *(["--3d"] if in_space else [])).exit_code == 0
-    given = [folder, "--map", file, "--prior-map", "truth"]
-    assert run("slam", *given, "--out", tmp_path / "first", *QUICK).exit_code == 0
+    assert run("init", "flight" if in_space else "recording", folder).exit_code == 0
+    given = ["map", "enter", file, folder, "--prior-map", "truth"]
+    assert run(*given, "--out", tmp_path / "first", *QUICK).exit_code == 0
     told = json.loads(run("map", "log", file, "--json").stdout)
     assert [row["kind"] for row in told["revisions"]] == ["edit", "session"]
     assert told["revisions"][0]["note"].endswith("surveyed landmarks")
@@ -157,8 +157,9 @@ def test_a_new_map_may_begin_with_a_survey(in_space: bool, tmp_path: Path) -> No
 def test_sessions_in_space_without_identities(tmp_path: Path) -> None:
     """A fixed map keeps its ids, though the frame of the recording says nothing of them."""
     folder, file = tmp_path / "flight", tmp_path / "map.evermap"
-    assert run("slam", "--init", folder, "--3d").exit_code == 0
-    assert run("slam", folder, "--unknown-ids", "--map", file, "--out", tmp_path / "one", *QUICK).exit_code == 0
+    assert run("init", "flight", folder).exit_code == 0
+    nameless = "--set", "unknown_ids=true"
+    assert run("map", "enter", file, folder, *nameless, "--out", tmp_path / "one", *QUICK).exit_code == 0
     with open_store(file) as store:
         first = store.load()
     prior = "--prior-map", tmp_path / "one" / "map.parquet"

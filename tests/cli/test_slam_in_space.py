@@ -16,15 +16,15 @@ def test_the_errors_of_a_run_are_printed_in_space_as_in_the_plane(
 ) -> None:
     from synthetic_run import make_run, make_spatial_run, with_spatial_changes
 
-    from evermap.cli.slam import _Asked, _write
+    from evermap.cli.recordings import RunRequest, write_results
     from evermap.config import Config
 
     recording, result = make_spatial_run() if spatial else make_run()
     config = Config.model_validate({"output": {"figures": False, "report": False}})
     if spatial:
         result = with_spatial_changes(result)
-    asked = _Asked(config, [], [], False, False, False, None, None, None)
-    _write(tmp_path / "run", recording, result, asked, 1.0)
+    asked = RunRequest(config, [], [], as_json=False, force=False)
+    write_results(tmp_path / "run", recording, result, asked, 1.0)
     printed = capsys.readouterr().out
     assert ("heading error, RMSE" in printed) is not spatial
     assert ("orientation error, RMSE" in printed) is spatial

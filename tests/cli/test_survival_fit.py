@@ -124,7 +124,7 @@ def test_persist_takes_what_was_kept(few: Path, tmp_path: Path) -> None:
     looks = tmp_path / "looks.csv"
     looks.write_text("stamp_s,feature_id,class_id,detected\n0,a,car,1\n0,b,pallet,1\n40,a,car,\n40,b,pallet,\n")
     result = CliRunner().invoke(
-        app, ["persist", str(looks), "--model", str(priors), "--out", str(tmp_path / "out"), "--figures", "0"]
+        app, ["persist", str(looks), "--set", f"model={priors}", "--out", str(tmp_path / "out"), "--set", "figures=0"]
     )
     assert result.exit_code == 0, result.stderr
     beliefs = np.genfromtxt(tmp_path / "out" / "beliefs.csv", delimiter=",", names=True)["p_exists"]

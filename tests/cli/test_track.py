@@ -26,7 +26,7 @@ def run(*arguments: str | Path) -> Result:
 def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the example as `detections.csv` and its run as `out`."""
     folder = tmp_path_factory.mktemp("yard")
-    assert run("track", "--init", folder / "detections.csv").exit_code == 0
+    assert run("init", "detections", folder / "detections.csv").exit_code == 0
     result = run("track", folder / "detections.csv", "--range-m", "12", "--out", folder / "out")
     assert result.exit_code == 0, result.stderr
     return folder
@@ -133,9 +133,7 @@ def test_parquet_says_what_csv_says(yard: Path) -> None:
 
 
 def test_same_table_same_files(yard: Path, tmp_path: Path) -> None:
-    result = run(
-        "track", yard / "detections.csv", "--range-m", "12", "--no-scene", "--out", tmp_path / "again", "--json"
-    )
+    result = run("track", yard / "detections.csv", "--range-m", "12", "--out", tmp_path / "again", "--json")
     assert result.exit_code == 0, result.stderr
     assert not (tmp_path / "again" / "scene.rrd").exists()
     for name in (
@@ -163,7 +161,7 @@ def test_survival_fit_takes_the_lifetimes(yard: Path) -> None:
 
 
 def test_without_range_misses_count_for_nothing(yard: Path, tmp_path: Path) -> None:
-    result = run("track", yard / "detections.csv", "--no-scene", "--out", tmp_path / "out")
+    result = run("track", yard / "detections.csv", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr
     assert "without --range-m" in result.stderr
     spells = rows(tmp_path / "out" / "spells.csv")
@@ -179,12 +177,11 @@ FEW = "stamp_s,x_m,y_m,z_m,class_id\n" + "".join(f"{0.1 * k:.1f},1,2,3,car\n" fo
     [
         (FEW, ("--range-m", "5"), "field '--range-m': the position of the sensor is unknown"),
         (FEW, ("--range-m", "-5"), "field '--range-m': input should be greater than 0"),
-        (FEW, ("--gap-s", "0"), "field '--gap-s': input should be greater than 0"),
-        (FEW, ("--min-score", "2"), "field '--min-score': the table has no scores"),
+        (FEW, ("--set", "gap_s=0"), "field 'track.gap_s': input should be greater than 0"),
+        (FEW, ("--set", "min_score=2"), "field 'min_score': the table has no scores"),
         (FEW, ("--prior", "bus=never-leaves"), "no detection is of class 'bus' (try: one of car)"),
         (FEW, ("--prior", "exponentail:mean=1h"), "try: exponential"),
-        (FEW, ("--speed", "bus=0.2"), "no detection is of class 'bus'"),
-        (FEW, ("--speed", "fast"), "'fast' is not CLASS=SPEED"),
+        (FEW, ("--set", "speeds_mps={bus=0.2}"), "no detection is of class 'bus'"),
         (FEW, ("--set", "warmup=2"), "field 'track.warmup': unknown key (try: track.warm_up)"),
         (FEW, ("--set", "warm_up=two"), "field 'track.warm_up': input should be a valid integer"),
         (FEW, ("--set", "p_detect=1.5"), "field 'track.p_detect': input should be less than 1, not 1.5"),
@@ -208,8 +205,8 @@ def test_mistake_is_one_line_and_2(
 
 def test_init_replaces_nothing_and_input_is_needed(tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text("mine")
-    assert "exists already" in run("track", "--init", tmp_path / "d.csv").stderr
+    assert "exists already" in run("init", "detections", tmp_path / "d.csv").stderr
     assert (tmp_path / "d.csv").read_text() == "mine"
     result = run("track")
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "--init" in result.stderr
+    assert "evermap init detections" in result.stderr

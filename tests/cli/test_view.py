@@ -28,8 +28,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view")
     for name, in_space in (("rec", False), ("flight", True)):
         write_template(folder / name, in_space=in_space)
-        files = ("--map", folder / f"{name}.evermap", "--out", folder / f"run-{name}")
-        made = run("slam", folder / name, *files, *QUICK)
+        files = (folder / f"{name}.evermap", folder / name, "--out", folder / f"run-{name}")
+        made = run("map", "enter", *files, *QUICK)
         assert made.exit_code == 0, made.output
     return folder
 

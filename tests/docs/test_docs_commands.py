@@ -13,13 +13,19 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+
+from evermap.cli.main import app
+from evermap.cli.moved import options_of, renew
 
 from .warm_commands import warm_commands
 
@@ -29,7 +35,7 @@ GENERATED = "reference/"
 """Pages that exist only in the site; `mkdocs build --strict` checks what leads there."""
 TIMEOUT_S = 300
 NUMBER = re.compile(r"([-+]?\d+(?:\.\d+)?)")
-LONG = re.compile(r"evermap (?:demo|slam(?! --init)|simulate|check|live)")
+LONG = re.compile(r"evermap (?:demo|slam|map enter|together|localize|simulate|check|live)")
 
 
 @dataclass(frozen=True)
@@ -205,6 +211,22 @@ def test_a_command_that_is_ready_ends_as_the_installed_one(line: str, tmp_path: 
     fresh, ready = ((end.returncode, end.stdout, end.stderr) for end in ends)
     assert ready == fresh
     assert ready[0] == (0 if line.endswith("--version") else 2)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_commands_of_a_page_are_in_the_new_spelling(page: Path) -> None:
+    """None is rewritten before it runs, as `evermap.cli.moved` does with old ones."""
+    root = typer.main.get_command(app)
+
+    def options(verb: str) -> Mapping[str, Any]:
+        found: Any = root
+        for word in verb.split():
+            found = found.get_command(None, word)
+        return options_of(found)
+
+    scripts = [block.command()[-1] for block in blocks(page) if block.language == "console"]
+    lines = re.findall(r"\bevermap ([^\n|;&#<>]+)", "\n".join(scripts).replace("$(", "("))
+    assert [line for line in lines if renew(shlex.split(line), options)[1] is not None] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))

@@ -58,7 +58,7 @@ def test_the_service_and_the_container_start_what_exists() -> None:
         options = [one for one in arguments if one.startswith("--")]
         assert options
         assert all(re.search(rf"{one}\b", shown) for one in options)
-        assert dict(zip(arguments[::2], arguments[1::2], strict=True))["--sensor"] == "sensor.toml"
+        assert dict(zip(arguments[1::2], arguments[2::2], strict=True))["--sensor"] == "sensor.toml"
     for copied in re.findall(r"^COPY (.*) \S+$", container, re.MULTILINE):
         assert all((REPOSITORY / name).exists() for name in copied.split())
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -57,7 +57,7 @@ def prepare() -> None:
     from evermap import interrupts
     from evermap.cli.main import run
 
-    for line in ("slam --init plane", "slam plane --map a", "slam --init space --3d", "slam space --out b"):
+    for line in ("init recording plane", "map enter a plane", "init flight space", "slam space --out b"):
         sys.argv = ["evermap", *line.split()]
         with suppress(SystemExit):
             run()

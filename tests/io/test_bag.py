@@ -67,7 +67,7 @@ def places(recording: SpatialRecording) -> Iterator[tuple[int, np.ndarray]]:
 def test_tags_are_where_they_are(name: str, detector: str, tmp_path: Path) -> None:
     bag = write(tmp_path / name, detector)
     if detector == "tags":
-        with pytest.raises(DataError, match=r"state the size of its tags.*--init-bag"):
+        with pytest.raises(DataError, match=r"state the size of its tags.*evermap init bag"):
             read_bag(bag)
         state_size(bag)
     assert reader_for(bag).name == "bag"
@@ -212,7 +212,7 @@ def test_what_is_guessed_is_told_and_reads_back_the_same(tmp_path: Path, assert_
     bag = write(tmp_path / "drive", "aruco")
     guessed = read_bag(bag)
     assert guessed.warnings == (
-        "topics as guessed: detections /camera/seen; odometry /odom (`--init-bag` writes them for editing)",
+        "topics as guessed: detections /camera/seen; odometry /odom (`evermap init bag` writes them for editing)",
     )
     text = bag_settings(bag)
     assert "#   /rosout_agg  std_msgs/msg/String  0" in text
@@ -293,11 +293,11 @@ def test_types_that_nothing_defines_are_told(tmp_path: Path) -> None:
 def test_settings_are_written_beside_the_bag_once(tmp_path: Path) -> None:
     bag = write(tmp_path / "drive", "tags")
     run = CliRunner().invoke
-    written = run(app, ["slam", "--init-bag", str(bag)])
+    written = run(app, ["init", "bag", str(bag)])
     assert written.exit_code == 0
     assert settings_path(bag).read_text() == bag_settings(bag)
     assert 'odometry = "/odom"' in written.output
-    again = run(app, ["slam", "--init-bag", str(bag)])
+    again = run(app, ["init", "bag", str(bag)])
     assert again.exit_code == 2
     assert "is there already" in again.output
 

@@ -62,7 +62,7 @@ def test_a_living_map_is_named(tmp_path: Path) -> None:
     from evermap.maps.store import open_store
 
     open_store(tmp_path / "site.evermap", create=True).close()
-    with pytest.raises(InputError, match=r"a living map of evermap, .*--map site\.evermap"):
+    with pytest.raises(InputError, match=r"a living map of evermap, .*map enter site\.evermap"):
         read_recording(tmp_path / "site.evermap")
 
 

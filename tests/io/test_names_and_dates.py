@@ -89,7 +89,7 @@ def test_a_map_tells_and_takes_texts(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
         return result.output
 
-    told("slam", recording, "--map", file, "--out", str(tmp_path / "run"))
+    told("map", "enter", file, recording, "--out", str(tmp_path / "run"))
     assert "door-3" in told("map", "show", file)
     assert "landmark door-3 " in told("map", "why", file, "door-3")
     assert "pinned landmark tag:17" in told("map", "pin", file, "tag:17")

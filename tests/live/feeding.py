@@ -71,7 +71,7 @@ def online(steps: list[Any]) -> Trajectory:
 
 
 def entered(path: Path, recording: Recording, config: Config = AT_THE_END) -> LivingMap:
-    """A recording entered into a stored map, as `evermap slam --map` does."""
+    """A recording entered into a stored map, as `evermap map enter` does."""
     with open_store(path, create=True) as store:
         em.enter_session(store, recording, config).commit(store, config)
         return store.load()

@@ -201,7 +201,7 @@ def test_an_edit_is_a_revision_that_can_be_reverted(site: Path) -> None:
 
 
 def test_export_for_nav2(site: Path, tmp_path: Path) -> None:
-    told = said("export", site, "--out", tmp_path / "speed.yaml", "--speed-mask", "--ahead", "3d", "--cell-m", 0.5)
+    told = said("nav2", site, "--out", tmp_path / "speed.yaml", "--speed-mask", "--ahead", "3d", "--cell-m", 0.5)
     living = MAPS[2]
     now, then = living.landmarks(), living.landmarks(at=living.stamp_s + 3 * 86_400.0)
     wrong = np.where(now.p_exists >= 0.5, 1.0 - then.p_exists, then.p_exists)
@@ -216,7 +216,7 @@ def test_export_for_nav2(site: Path, tmp_path: Path) -> None:
     line = {"type": "LineString", "coordinates": ends.tolist()}
     way = {"type": "Feature", "properties": {"id": 9, "startid": 0, "endid": 1}, "geometry": line}
     (tmp_path / "in.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [*nodes, way]}))
-    told = said("export", site, "--out", tmp_path / "open.geojson", "--route-graph", tmp_path / "in.geojson")
+    told = said("nav2", site, "--out", tmp_path / "open.geojson", "--route-graph", tmp_path / "in.geojson")
     assert told["closed"] == [9]
     assert len(json.loads((tmp_path / "open.geojson").read_text())["features"]) == 2
 
@@ -311,7 +311,7 @@ def test_compact_tells_what_it_saved(site: Path) -> None:
     [
         (
             ("log", "nowhere.evermap"),
-            "nowhere.evermap: no such map (try: evermap slam INPUT --map nowhere.evermap starts",
+            "nowhere.evermap: no such map (try: evermap map enter nowhere.evermap INPUT starts",
         ),
         (("show", "SITE", "--revision", "9"), "no revision 9; it has 3 of them (try: evermap map log"),
         (("diff", "SITE", "9"), "no revision 9"),
@@ -323,9 +323,9 @@ def test_compact_tells_what_it_saved(site: Path) -> None:
             ("export", "SITE", "--out", "map.png"),
             "map.png: cannot write a '.png' map (try: parquet, wpilib",
         ),
-        (("export", "SITE", "--out", "s.csv", "--speed-mask"), "s.csv: field '--speed-mask': is an image"),
-        (("export", "SITE", "--out", "s.csv", "--route-graph", "g"), "s.csv: field '--route-graph': is written as Geo"),
-        (("export", "SITE", "--out", "s.json", "--route-graph", "no"), "no: cannot be read: No such file"),
+        (("nav2", "SITE", "--out", "s.csv", "--speed-mask"), "s.csv: field '--speed-mask': is an image"),
+        (("nav2", "SITE", "--out", "s.csv", "--route-graph", "g"), "s.csv: field '--route-graph': is written as Geo"),
+        (("nav2", "SITE", "--out", "s.json", "--route-graph", "no"), "no: cannot be read: No such file"),
         (("show", "SITE", "--figure", "map.pdf"), "cannot draw a '.pdf' file"),
         (("show", "SITE", "--ahead", "3"), "'3' has no unit"),
     ],

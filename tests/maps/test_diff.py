@@ -237,7 +237,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     views = [(0.0, 0.6), (0.0, 1.0), (0.3, 1.0), (0.0, 1.0), (0.0, 0.7)]
     for day, (recording, view) in enumerate(zip(simulate_building(config, seed=11).sessions, views, strict=True)):
         write_native(part_of(recording, *view), folder / f"day{day}")
-        run("slam", folder / f"day{day}", "--map", folder / "site.evermap", "--out", folder / f"out{day}", *QUICK,
+        run("map", "enter", folder / "site.evermap", folder / f"day{day}", "--out", folder / f"out{day}", *QUICK,
             "--set", f"output.report={str(day in REPORTS).lower()}")  # fmt: skip
     return folder / "site.evermap"
 

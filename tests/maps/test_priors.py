@@ -181,7 +181,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
                             sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0))  # fmt: skip
     for day, recording in enumerate(simulate_building(config, seed=4).sessions):
         write_native(recording, folder / f"day{day}")
-        result = run("slam", folder / f"day{day}", "--map", folder / "site.evermap", "--out", folder / f"out{day}",
+        result = run("map", "enter", folder / "site.evermap", folder / f"day{day}", "--out", folder / f"out{day}",
                      *([] if day else priors), "--set", "output.figures=false", "--set", "output.report=false",
                      "--set", "output.rerun=false", "--set", "slam.calibration.fix.range_slope=0.0")  # fmt: skip
         assert result.exit_code == 0, result.output
@@ -218,7 +218,7 @@ def test_a_map_tells_what_it_was_told_and_gives_what_it_learned(site: Path, tmp_
     ],
 )
 def test_mistakes_are_one_line(site: Path, tmp_path: Path, prior: str, words: list[str]) -> None:
-    result = run("slam", site.parent / "day1", "--map", tmp_path / "new.evermap", "--out", tmp_path / "out", "--prior",
+    result = run("map", "enter", tmp_path / "new.evermap", site.parent / "day1", "--out", tmp_path / "out", "--prior",
                  prior)  # fmt: skip
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
@@ -228,7 +228,7 @@ def test_mistakes_are_one_line(site: Path, tmp_path: Path, prior: str, words: li
 def test_a_file_may_tell_of_classes_that_the_site_has_not_yet(site: Path, tmp_path: Path) -> None:
     said = {name: RunLength(WEIBULL, ENDLESS, 60.0) for name in ("crane", "pallet", "")}
     file, new = save_models(NamedModels(said, "class"), tmp_path / "company.json"), tmp_path / "new.evermap"
-    result = run("slam", site.parent / "day0", "--map", new, "--out", tmp_path / "out", "--prior", file, "--set",
+    result = run("map", "enter", new, site.parent / "day0", "--out", tmp_path / "out", "--prior", file, "--set",
                  "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false")  # fmt: skip
     assert result.exit_code == 0, result.output
     shown = json.loads(run("map", "show", new, "--json").stdout)["priors"]
@@ -238,4 +238,4 @@ def test_a_file_may_tell_of_classes_that_the_site_has_not_yet(site: Path, tmp_pa
 def test_a_prior_needs_a_map(tmp_path: Path) -> None:
     result = run("slam", tmp_path, "--prior", "never-leaves")
     assert result.exit_code == 2
-    assert "--map" in result.stderr
+    assert "evermap map enter MAP INPUT --prior" in result.stderr

@@ -216,9 +216,9 @@ def test_another_database_is_no_map(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "line"),
     [
-        (lambda p: None, r"no such map \(try: evermap slam INPUT --map .*m\.evermap starts one\)"),
+        (lambda p: None, r"no such map \(try: evermap map enter .*m\.evermap INPUT starts one\)"),
         (lambda p: p.mkdir(), r"is a folder; a map is one file \(try: .*m\.evermap"),
-        (lambda p: p.touch(), r"contains no map \(try: evermap slam INPUT --map FILE writes one\)"),
+        (lambda p: p.touch(), r"contains no map \(try: evermap map enter FILE INPUT writes one\)"),
     ],
 )
 def test_no_map_at_all(tmp_path: Path, make: Callable[[Path], None], line: str) -> None:

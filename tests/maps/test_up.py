@@ -94,13 +94,13 @@ def test_nav2_refuses_a_map_without_a_floor(tmp_path: Path) -> None:
         ("speed.yaml", ["--speed-mask"]),
         ("open.geojson", ["--route-graph", graph]),
     ):
-        done = run("export", site, "--out", tmp_path / out, *more)
+        done = run("nav2", site, "--out", tmp_path / out, *more)
         assert done.exit_code == 2
         assert "the map has no floor, since up is unknown" in done.output
         assert "--up" in done.output
         assert not (tmp_path / out).exists()
     doubtful = stored(tmp_path / "doubtful.evermap", rig_map(up_along(0.0, -1.0, 0.0, sigma_rad=0.3)))
-    assert "only (0.000, -1.000, 0.000) within 17.2 deg" in run("export", doubtful, "--out", tmp_path / "k.yaml").output
+    assert "only (0.000, -1.000, 0.000) within 17.2 deg" in run("nav2", doubtful, "--out", tmp_path / "k.yaml").output
 
 
 @pytest.mark.parametrize("by_option", [False, True])
@@ -109,7 +109,7 @@ def test_masks_are_projected_along_up(tmp_path: Path, by_option: bool) -> None:
     living = rig_map(None if by_option else up_along(0.0, -1.0, 0.0))
     site = stored(tmp_path / "rig.evermap", living)
     option = ["--up", "0,-3,0"] if by_option else []
-    done = run("export", site, "--out", tmp_path / "keepout.yaml", "--radius-m", "0.2", *option, "--json")
+    done = run("nav2", site, "--out", tmp_path / "keepout.yaml", "--radius-m", "0.2", *option, "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["up"]["direction"] == [0.0, -1.0, 0.0]
     landmarks = living.landmarks(p_least=0.5)

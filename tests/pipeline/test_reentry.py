@@ -199,7 +199,7 @@ def test_sites_are_entered_alike_in_one_process_and_in_many(tmp_path: Path) -> N
 
     one = run("--out", str(tmp_path / "one"), "--workers", "1")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        many = run("--out", str(tmp_path / "many"), "--cluster", cluster.scheduler_address)
+        many = run("--out", str(tmp_path / "many"), "--workers", cluster.scheduler_address)
     assert one == many
     assert one["new"]["sessions"] == 0
     for site in ("dock", "hall"):
@@ -217,7 +217,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     with open_store(path) as store:  # a session without its recording
         store.commit(store.load(), Provenance(stamp_from_s=1e9, stamp_to_s=2e9), parent=1)
     data = path.read_bytes()
-    for words in (["--adopt"], ["--workers", "2", "--cluster", "tcp://localhost:8786"]):
+    for words in (["--adopt"], ["--workers", "0"], ["--workers", "many"]):
         result = CliRunner().invoke(app, ["map", "reenter", str(path), "--out", str(tmp_path / "out"), *words])
         assert result.exit_code == 2
         assert result.stderr.count("\n") == 1, result.stderr

@@ -115,12 +115,12 @@ def test_a_store_of_maps_and_workers_give_the_same_bytes(maps: Path, tmp_path: P
     distributed = pytest.importorskip("distributed")
     assert run("--store", maps, "--out", tmp_path / "one", "--workers", "1").exit_code == 0
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        result = run("--store", maps, "--out", tmp_path / "many", "--cluster", cluster.scheduler_address)
+        result = run("--store", maps, "--out", tmp_path / "many", "--workers", cluster.scheduler_address)
         assert result.exit_code == 0, result.output
         (maps.parent / "damaged").mkdir()
         damaged = maps.parent / "damaged" / "gate.evermap"
         damaged.write_bytes(b"SQLite format 3\x00" + bytes(2000))
-        result = run(*maps.glob("*.evermap"), damaged, "--out", tmp_path / "no", "--cluster", cluster.scheduler_address)
+        result = run(*maps.glob("*.evermap"), damaged, "--out", tmp_path / "no", "--workers", cluster.scheduler_address)
         assert result.exit_code == 2
         assert result.stderr.count("\n") == 1
         assert "gate.evermap" in result.stderr
@@ -132,8 +132,8 @@ def test_mistakes_are_one_line(maps: Path, tmp_path: Path, monkeypatch: pytest.M
     dock = maps / "dock.evermap"
     for words, arguments in {
         ("evermap[cluster]",): ("--store", maps, "--workers", "2"),
-        ("evermap[cluster]", "Dask"): ("--store", maps, "--cluster", "tcp://localhost:8786"),
-        ("--workers",): ("--store", maps, "--workers", "2", "--cluster", "tcp://localhost:8786"),
+        ("evermap[cluster]", "Dask"): ("--store", maps, "--workers", "tcp://localhost:8786"),
+        ("--workers", "1 to 1024"): ("--store", maps, "--workers", "1025"),
         ("'dock'", "MAP"): (dock, dock),
         ("'dock'", "--store"): (dock, "--store", maps),
         ("nowhere.evermap",): (dock, tmp_path / "nowhere.evermap"),

@@ -10,13 +10,11 @@ import typer
 from evermap.cli.options import (
     AsJson,
     ConfigFile,
-    EmptyIds,
     Robot,
     Settings,
     ShowConfig,
     UnknownIds,
     argument,
-    associated,
     configured,
     option,
 )
@@ -48,7 +46,6 @@ def check(
     config: ConfigFile = None,
     settings: Settings = None,
     unknown_ids: UnknownIds = False,
-    empty_ids: EmptyIds = False,
     quick: Annotated[bool, option("--quick", "Look at the readings alone, without a solution.")] = False,
     show_config: ShowConfig = False,
     as_json: AsJson = False,
@@ -67,7 +64,7 @@ def check(
       evermap check my-recording --unknown-ids
       evermap check monday.mcap --quick
     """
-    given = {"slam.unknown_ids": associated(unknown_ids, empty_ids)}
+    given = {"slam.unknown_ids": unknown_ids or None}
     chosen = configured(config, settings, given, within="slam.check", also=["sensor"], show=show_config)
     from evermap.io import read_recording
     from evermap.runs.summary import verdict_dict

@@ -101,7 +101,7 @@ def _summary(path: Path) -> dict[str, Any] | None:
 
 
 def _run(path: Path, summary: dict[str, Any]) -> Described:
-    from evermap.cli.slam import main_numbers
+    from evermap.cli.recordings import main_numbers
 
     folder = path if path.is_dir() else path.parent
     counts, timing = summary.get("counts") or {}, summary.get("timing") or {}

@@ -11,7 +11,6 @@ from evermap.cli.options import (
     DEFAULT_STORE,
     STORE_VARIABLE,
     AsJson,
-    Cluster,
     ConfigFile,
     Force,
     Settings,
@@ -20,8 +19,8 @@ from evermap.cli.options import (
     argument,
     configured,
     database_errors,
-    one_of,
     option,
+    workers_of,
 )
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say
 from evermap.errors import ConfigError
@@ -39,14 +38,14 @@ site has, and the more alike the sites are. Both are learned from the histories 
 
 \b
 --out gets company.json, for sites without a map, and sites/NAME.json, for each site: files for --prior of
-`evermap slam --map`, and for `evermap persist --model`.
+`evermap map enter`, and for `evermap persist --set model=FILE`.
 
 \b
 Examples:
   evermap learn maps/*.evermap --out lifetimes
   evermap learn --store postgresql://evermap@db/fleet --workers 4
-  evermap learn --store maps --cluster tcp://scheduler:8786
-  evermap slam day9 --map maps/ward-3.evermap --prior lifetimes/sites/ward-3.json
+  evermap learn --store maps --workers tcp://scheduler:8786
+  evermap map enter maps/ward-3.evermap day9 --prior lifetimes/sites/ward-3.json
 """
 
 
@@ -68,7 +67,6 @@ def learn(
     store: Store = None,
     out: Annotated[Path, option("Folder for the lifetimes.")] = Path("evermap-out/lifetimes"),
     workers: Workers = None,
-    cluster: Cluster = None,
     force: Force = False,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -80,13 +78,13 @@ def learn(
     from evermap.runs.company import Company, collect
     from evermap.runs.folder import RunFolder
 
-    one_of(workers, cluster)
+    count, cluster = workers_of(workers)
     sites = sites_of(maps or [], store, cluster)
     files = [where for where in sites.values() if "://" not in where]
     with RunFolder(out, force=force, inputs=files) as folder:
         with progress_bar("reading maps", speed=False) as progress:
             found = collect(
-                list(sites.values()), chosen.living.lifetimes, workers=workers, cluster=cluster, progress=progress
+                list(sites.values()), chosen.living.lifetimes, workers=count, cluster=cluster, progress=progress
             )
         settings_told = {"living": {"lifetimes": chosen.living.lifetimes.to_dict()}}
         told = {"command": command_line(), "input": ", ".join(sites), "config": settings_told}
@@ -183,4 +181,4 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         rows.append((name or "any other", *(f"{number:,}" for number in numbers), half))
     title = f"{len(summary['sites'])} sites, mean stays differ by a factor of {summary['factor_between_sites']:.1f}"
     print_table(title, rows, ("class", "sites", "stays", "ended", "half gone at a new site"), numbers=(1, 2, 3))
-    say(f"written to {out}; use it with: evermap slam REC --map MAP --prior {out}/sites/SITE.json")
+    say(f"written to {out}; use it with: evermap map enter MAP INPUT --prior {out}/sites/SITE.json")

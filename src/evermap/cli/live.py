@@ -17,8 +17,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import ConfigFile, Robot, Settings, Topics, configured, option, refuse_given
-from evermap.cli.terminal import echo, print_table, say, warm_up, warn
+from evermap.cli.options import (
+    ConfigFile,
+    ResultAsJson,
+    Robot,
+    Settings,
+    Topics,
+    argument,
+    configured,
+    option,
+    refuse_given,
+)
+from evermap.cli.terminal import echo, print_json, print_table, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import kept, watched
 
@@ -38,11 +48,13 @@ MMAP_THRESHOLD, LARGE = -3, 2**18
 """A parameter of glibc's `mallopt`, and the size [bytes] above which freed blocks are returned to the system."""
 
 
-MapFile = Annotated[
-    str | None,
-    option("--map", "Living map, created if it does not exist; without it, only --replay is sent.", metavar="FILE"),
+LocalMap = Annotated[
+    str, argument("The living map, a file; created if it does not exist.", metavar="MAP", default=False)
 ]
-Replay = Annotated[Path | None, option("A recording or bag to replay in place of a robot.", metavar="INPUT")]
+Replay = Annotated[
+    Path | None,
+    argument("A recording or bag to replay in place of a robot.", metavar="[INPUT]", default=False),
+]
 SensorFile = Annotated[Path | None, option("Sensor description, as the sensor.toml of a recording.", metavar="FILE")]
 ZenohEndpoint = Annotated[
     str | None,
@@ -55,7 +67,7 @@ Lines = Annotated[bool, option("--json", "Print poses and changes at once, one J
 
 
 def live(
-    map_file: MapFile = None,
+    map_file: LocalMap,
     replay: Replay = None,
     sensor: SensorFile = None,
     zenoh: ZenohEndpoint = None,
@@ -77,10 +89,9 @@ def live(
 
     \b
     Examples:
-      evermap live --replay tuesday --map building.evermap
-      evermap live --replay tuesday --map building.evermap --localize --realtime --json
-      evermap live --map building.evermap --sensor sensor.toml --zenoh tcp/localhost:7447 --foxglove 8765
-      evermap live --replay tuesday --zenoh listen=tcp/localhost:7447
+      evermap live building.evermap tuesday
+      evermap live building.evermap tuesday --localize --realtime --json
+      evermap live building.evermap --sensor sensor.toml --zenoh tcp/localhost:7447 --foxglove 8765
     """
     from evermap.io import read_recording
     from evermap.live.wires import Mailbox, wires_of
@@ -88,29 +99,54 @@ def live(
     from evermap.slam.plane import in_its_space
 
     chosen = configured(config, settings, within="live", also=["slam", "living", "sensor", "output"])
-    if map_file is not None and is_address(map_file):
-        hint = "--map FILE, and send its recordings to the server"
-        raise ConfigError("must be a local file: readings are stored next to it", field="map", hint=hint)
+    if is_address(map_file):
+        hint = "a file, and send its recordings to the server"
+        raise ConfigError("must be a local file: readings are stored next to it", field="MAP", hint=hint)
     connected = zenoh is not None or foxglove is not None
-    told = {"localize": localize or None, "as_json": as_json or None, "config": config, "settings": settings}
     if replay is None:
-        refuse_given("is for a replay", "--replay INPUT", robot=robot, realtime=realtime or None)
-    elif map_file is None:
-        refuse_given("needs a map", "--map FILE", sensor=sensor, topics=topics, **told)
-    _check_source(map_file, replay, sensor, connected=connected)
+        refuse_given("is for a replay", "evermap live MAP INPUT", robot=robot, realtime=realtime or None)
+    _check_source(replay, sensor, connected=connected)
     recording = None if replay is None else read_recording(replay, robot=robot)
-    if recording is not None and map_file is not None and sensor is None and topics is None:
+    if recording is not None and sensor is None and topics is None:
         recording = in_its_space(recording, chosen.slam, dim=_dimension_of(Path(map_file)))
-    _check_needed(recording, chosen, sensor, topics, map_file=map_file, connected=connected)
+    _check_needed(recording, chosen, sensor, topics, connected=connected)
     mailbox = Mailbox() if replay is None else None
-    wires = wires_of(zenoh, foxglove, mailbox)
-    try:
-        if map_file is None:
-            assert recording is not None
-            _be_the_robot(recording, wires)
-            return
-        drive = _Drive(Path(map_file), chosen, sensor, topics, mailbox, recording)
+    drive = _Drive(Path(map_file), chosen, sensor, topics, mailbox, recording)
+    with _opened(wires_of(zenoh, foxglove, mailbox)) as wires:
         drive.run(wires, localize=localize, realtime=realtime, as_json=as_json)
+
+
+def play(
+    input: Annotated[Path, argument("A recording or bag.", metavar="INPUT", default=False)],
+    zenoh: ZenohEndpoint = None,
+    foxglove: FoxglovePort = None,
+    robot: Robot = None,
+    as_json: ResultAsJson = False,
+) -> None:
+    """Send a recording as a robot would, at its pace.
+
+    The messages are those that `evermap live` listens to: /odom, /detections, /tf_static.
+
+    \b
+    Example:
+      evermap play tuesday --zenoh listen=tcp/localhost:7447
+    """
+    from evermap.io import read_recording
+    from evermap.live.wires import wires_of
+
+    if zenoh is None and foxglove is None:
+        raise ConfigError("no connection", field="zenoh", hint="--zenoh tcp/localhost:7447, or --foxglove 8765")
+    recording = read_recording(input, robot=robot)
+    _check_ranges(recording, configured(None, None))
+    with _opened(wires_of(zenoh, foxglove, None)) as wires:
+        _be_the_robot(recording, wires, as_json=as_json)
+
+
+@contextmanager
+def _opened(wires: Sequence[Wire]) -> Iterator[Sequence[Wire]]:
+    """Close connections in the end."""
+    try:
+        yield wires
     finally:
         for wire in wires:
             wire.close()
@@ -127,50 +163,48 @@ def _dimension_of(map_file: Path) -> int | None:
     return living.dim if len(living.places) else None
 
 
-def _check_source(map_file: str | None, replay: Path | None, sensor: Path | None, *, connected: bool) -> None:
-    """Refuse a drive without a map, readings, or a sensor."""
-    if map_file is None and (replay is None or not connected):
-        raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
+def _check_source(replay: Path | None, sensor: Path | None, *, connected: bool) -> None:
+    """Refuse a drive without readings, or a sensor."""
     if replay is None and not connected:
-        raise ConfigError(
-            "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
-        )
-    if map_file is not None and replay is None and sensor is None:
+        hint = "--zenoh tcp/localhost:7447, --foxglove 8765, or evermap live MAP INPUT"
+        raise ConfigError("no robot", field="zenoh", hint=hint)
+    if replay is None and sensor is None:
         raise ConfigError("the sensor is not described", field="sensor", hint="--sensor sensor.toml")
 
 
 def _check_needed(
-    recording: AnyRecording | None,
-    config: Config,
-    sensor: Path | None,
-    topics: Path | None,
-    *,
-    map_file: str | None,
-    connected: bool,
+    recording: AnyRecording | None, config: Config, sensor: Path | None, topics: Path | None, *, connected: bool
 ) -> None:
     """Refuse a recording of ranges only, and files that would say what a recording in the plane says itself."""
-    from evermap.slam.cleaning import of_ranges_only
     from evermap.types import is_in_space
 
     if recording is None:
         return
-    if not is_in_space(recording) and of_ranges_only(recording.detections, config.slam.cleaning):
-        problem = f"'{recording.name}' has ranges without bearings, which are located by what is seen later"
-        raise ConfigError(problem, field="replay", hint="evermap slam --map")
-    if is_in_space(recording) and sensor is None and map_file is not None:
+    _check_ranges(recording, config)
+    if is_in_space(recording) and sensor is None:
         if connected:
             problem = f"'{recording.name}' is in space, and connections take poses in the plane"
-            raise ConfigError(problem, field="replay", hint="--sensor FILE: in the plane; or without connections")
+            raise ConfigError(problem, field="INPUT", hint="--sensor FILE: in the plane; or without connections")
         if recording.odometry is None:
             problem = f"'{recording.name}' has no odometry; it is solved when it ends"
-            raise ConfigError(problem, field="replay", hint="evermap slam --map")
+            raise ConfigError(problem, field="INPUT", hint="evermap map enter")
     for name, path in (("sensor", sensor), ("topics", topics)):
         if path is not None and not is_in_space(recording):
             problem = f"'{recording.name}' describes its topics and sensors itself"
             raise ConfigError(problem, field=name, hint=f"omit --{name}; it is for messages and bags")
 
 
-def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
+def _check_ranges(recording: AnyRecording, config: Config) -> None:
+    """Refuse a recording of ranges only."""
+    from evermap.slam.cleaning import of_ranges_only
+    from evermap.types import is_in_space
+
+    if not is_in_space(recording) and of_ranges_only(recording.detections, config.slam.cleaning):
+        problem = f"'{recording.name}' has ranges without bearings, which are located by what is seen later"
+        raise ConfigError(problem, field="INPUT", hint="evermap map enter")
+
+
+def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire], *, as_json: bool) -> None:
     """Send the messages of a robot that drives as in a recording, at its pace."""
     from evermap.live.ros import play
 
@@ -180,6 +214,9 @@ def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
             count = play(recording, wires, watch.stop_if_asked)
         except KeyboardInterrupt:
             say("stopped before the recording ended")
+            return
+        if as_json:
+            print_json({"recording": recording.name, "messages": count})
         else:
             say(f"sent {count} messages")
 

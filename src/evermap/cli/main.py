@@ -8,6 +8,8 @@ from __future__ import annotations
 import errno
 import sys
 import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
@@ -19,14 +21,18 @@ from evermap.cli import (
     bench,
     check,
     convert,
+    in_map,
     info,
+    init,
     learn,
     live,
+    moved,
     persist,
     reproduce,
     serve,
     slam,
     survival,
+    together,
     track,
     view,
 )
@@ -56,6 +62,23 @@ class Verbs(TyperGroup):
         """Return the command of a verb; None if there is none of this name."""
         return super().get_command(ctx, cmd_name) or reproduce.command("evermap.verbs", cmd_name)
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that is to run, of a command line that may be in an old spelling."""
+
+        def options_of(verb: str) -> Mapping[str, Any]:
+            found = self
+            for word in verb.split():
+                found = found.get_command(ctx, word)
+            return moved.options_of(found)
+
+        tables = moved.MOVED
+        group, words = ("evermap.studies", args[1:2]) if args[0] == "reproduce" else ("evermap.verbs", args[:1])
+        if words and words[0] in plugins.found(group):  # options of it that its package has moved
+            name = " ".join(args[:2] if args[0] == "reproduce" else args[:1])
+            tables = {name: getattr(plugins.load(group, words[0]), "moved", {})}
+        args, ctx.meta[moved.NOW] = moved.renew(args, options_of, tables)
+        return super().resolve_command(ctx, args)
+
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """Parse and run; a wrong command line is one line as any other mistake, not a paragraph."""
         kwargs["standalone_mode"] = False
@@ -73,7 +96,8 @@ class Verbs(TyperGroup):
         """Run the verb; every exception that we cause or can explain becomes a line on stderr and an exit code."""
         warnings.showwarning = _show_warning
         try:
-            return super().invoke(ctx)
+            with _last_line(ctx):
+                return super().invoke(ctx)
         except EvermapError as error:
             name_options(error, ctx)
             fail(error.one_line())
@@ -95,6 +119,19 @@ class Verbs(TyperGroup):
             raise typer.Exit(EXIT_DEFECT) from None
 
 
+@contextmanager
+def _last_line(ctx: Any) -> Iterator[None]:
+    """Name the new spelling of an old command line once it has run; an error stays one line."""
+    try:
+        yield
+    except typer.Exit as end:
+        if end.exit_code != EXIT_USER and (line := ctx.meta.get(moved.NOW)):
+            say(line)
+        raise
+    if line := ctx.meta.get(moved.NOW):
+        say(line)
+
+
 app = typer.Typer(
     cls=Verbs,
     name="evermap",
@@ -106,11 +143,15 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+app.command("init")(init.init)
 app.command("check")(check.check)
 app.command("info")(info.info)
 app.command("slam", help=slam.HELP)(slam.slam)
+app.command("localize", help=in_map.LOCALIZE)(in_map.localize)
+app.command("together", help=together.HELP)(together.together)
 app.command("audit", help=audit.HELP)(audit.audit)
 app.command("live")(live.live)
+app.command("play")(live.play)
 app.command("persist", help=persist.HELP)(persist.persist)
 app.command("track", help=track.HELP)(track.track)
 app.command("view")(view.view)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evermap.cli.in_map import ENTER, enter
 from evermap.cli.learn import Maps, Store, sites_of
-from evermap.cli.map_export import export
+from evermap.cli.map_export import NAV2, export, nav2
 from evermap.cli.options import (
     AtRevision,
-    Cluster,
     ConfigFile,
     MapFile,
     ResultAsJson,
@@ -21,8 +21,8 @@ from evermap.cli.options import (
     Workers,
     argument,
     configured,
-    one_of,
     option,
+    workers_of,
 )
 from evermap.cli.terminal import (
     check_picture,
@@ -252,7 +252,9 @@ def _print_why(answer: Answer) -> None:
         print_table("what the sessions saw", rows, head, numbers=(0, 4, 5, 6, 7, 8, 9))
 
 
+app.command("enter", help=ENTER)(enter)
 app.command("export")(export)
+app.command("nav2", help=NAV2)(nav2)
 
 
 @app.command("why")
@@ -395,7 +397,6 @@ def reenter(
     out: Annotated[Path, option("Folder of the copies, to continue from.")] = Path("evermap-out/reentered"),
     adopt: Annotated[bool, option("--adopt", "Append them to the maps, each at once.")] = False,
     workers: Workers = None,
-    cluster: Cluster = None,
     config: ConfigFile = None,
     settings: Settings = None,
     as_json: ResultAsJson = False,
@@ -409,9 +410,9 @@ def reenter(
     \b
     Examples:
       evermap map reenter maps/*.evermap --set living.returns=false --adopt
-      evermap map reenter --store postgresql://evermap@db/fleet --cluster tcp://scheduler:8786 --out /shared/reentered
+      evermap map reenter --store postgresql://evermap@db/fleet --workers tcp://scheduler:8786 --out /shared/reentered
     """
-    one_of(workers, cluster)
+    count, cluster = workers_of(workers)
     chosen = configured(config, settings) if config or settings else None
     from evermap.runs.company import reenter_all
 
@@ -422,7 +423,7 @@ def reenter(
         raise ConfigError(f"cannot be made: {error.strerror}", path=out, field="out", hint="another folder") from None
     with progress_bar("entering sessions", speed=False) as progress:
         found = reenter_all(
-            sites, out.absolute(), chosen, adopt=adopt, workers=workers, cluster=cluster, progress=progress
+            sites, out.absolute(), chosen, adopt=adopt, workers=count, cluster=cluster, progress=progress
         )
     done = {site: one for site, one in found.items() if not isinstance(one, EvermapError)}
     failed = {site: one for site, one in found.items() if isinstance(one, EvermapError)}

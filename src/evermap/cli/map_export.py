@@ -1,9 +1,9 @@
-"""`evermap map export`: landmarks and lifetimes of a living map as files of other tools."""
+"""`evermap map export`: landmarks and lifetimes of a living map as files of other tools; `map nav2`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.types import Landmarks, Up
 
+    Writer = Callable[[LivingMap, Landmarks], dict[str, Any]]
+    """Writes a file; returns facts for the summary."""
+
 _ExportOut = Annotated[
     Path | None,
-    option(
-        "Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for a grid.", metavar="FILE", default=False
-    ),
+    option("Where to write the landmarks: .parquet, .geojson or .csv.", metavar="FILE", default=False),
 ]
 _ExportFormat = Annotated[
     str | None,
@@ -35,13 +36,14 @@ _ExportFormat = Annotated[
 _ExportLifetimes = Annotated[
     Path | None, option("Where to write the lifetimes by class.", metavar="FILE.json", default=False)
 ]
-_PLeast = Annotated[
+_PLeast = Annotated[float, option("Leave out landmarks with a smaller P(exists).", min=0.0, max=1.0)]
+_PLeastOfNav2 = Annotated[
     float | None,
     option(
         "Leave out landmarks with a smaller P(exists).",
         min=0.0,
         max=1.0,
-        default="0.5; 0 for Nav2's speed mask and route graph",
+        default="0.5; 0 for the speed mask and the route graph",
     ),
 ]
 _SpeedMask = Annotated[bool, option("--speed-mask", "Write --out FILE.yaml as the mask of Nav2's speed filter.")]
@@ -50,14 +52,6 @@ _RouteGraph = Annotated[
     option("Write this route graph of Nav2 to --out, without blocked edges.", metavar="IN.geojson", default=False),
 ]
 _MapAge = Annotated[str, option("With --speed-mask: age of the map when it is used.")]
-_UpDirection = Annotated[
-    str | None,
-    option(
-        "Of a map in space of which it is not known: the direction of up in its frame.",
-        metavar="X,Y,Z",
-        default="as known",
-    ),
-]
 _CellM = Annotated[float, option("Edge of a cell of the grid [m].", min=1e-3, max=1e3)]
 _RadiusM = Annotated[
     float | None,
@@ -68,6 +62,26 @@ _RadiusM = Annotated[
         default="0.25; 1 for the speed mask; 0.5 for the route graph",
     ),
 ]
+_UpDirection = Annotated[
+    str | None,
+    option(
+        "Of a map in space of which it is not known: the direction of up in its frame.",
+        metavar="X,Y,Z",
+        default="as known",
+    ),
+]
+NAV2 = """\
+Write a file of Nav2.
+
+Landmarks as obstacles of a grid, where to drive slowly, or which ways are open.
+
+\b
+Examples:
+  evermap map nav2 site.evermap --out keepout.yaml --p-least 0.1
+  evermap map nav2 site.evermap --out speed.yaml --speed-mask --ahead 12h
+  evermap map nav2 site.evermap --out open.geojson --route-graph graph.geojson
+  evermap map nav2 rig.evermap --out keepout.yaml --up 0,-1,0
+"""
 
 
 def export(
@@ -76,52 +90,99 @@ def export(
     format_name: _ExportFormat = None,
     lifetimes: _ExportLifetimes = None,
     revision: AtRevision = None,
-    p_least: _PLeast = None,
-    speed_mask: _SpeedMask = False,
-    route_graph: _RouteGraph = None,
-    ahead: _MapAge = "1d",
-    cell_m: _CellM = 0.05,
-    radius_m: _RadiusM = None,
+    p_least: _PLeast = 0.5,
     up: _UpDirection = None,
     as_json: ResultAsJson = False,
 ) -> None:
     """Write existing landmarks, or learned lifetimes, to a file.
 
-    For other tools, for `evermap slam --prior-map`, for `--prior` of another map, and as a mask for filters of Nav2.
+    For other tools, for `evermap slam --prior-map`, and for `--prior` of another map.
 
     \b
     Examples:
       evermap map export site.evermap --out map.geojson
       evermap map export site.evermap --out field.json --format wpilib
       evermap map export site.evermap --lifetimes lifetimes.json
-      evermap map export site.evermap --out keepout.yaml --p-least 0.1
-      evermap map export site.evermap --out speed.yaml --speed-mask --ahead 12h
-      evermap map export site.evermap --out open.geojson --route-graph graph.geojson
-      evermap map export rig.evermap --out keepout.yaml --up 0,-1,0
     """
+    from evermap.io.map_formats import format_called, write_map
+
+    if out is None and lifetimes is None:
+        raise ConfigError("nothing to write", field="--out", hint="--out map.geojson, or --lifetimes lifetimes.json")
+    write: Writer | None = None
+    if out is not None:
+        kind = format_called(format_name, out)
+
+        def write(_: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+            write_map(landmarks, out, kind)
+            return {"format": kind.name}
+
+    _write_files(file, out, write, lifetimes, revision=revision, p_least=p_least, up=up, as_json=as_json)
+
+
+def nav2(
+    file: MapFile,
+    out: Annotated[Path, option("The file to write: .yaml of a grid, .geojson of a route graph.", metavar="FILE")],
+    speed_mask: _SpeedMask = False,
+    route_graph: _RouteGraph = None,
+    revision: AtRevision = None,
+    p_least: _PLeastOfNav2 = None,
+    ahead: _MapAge = "1d",
+    cell_m: _CellM = 0.05,
+    radius_m: _RadiusM = None,
+    up: _UpDirection = None,
+    as_json: ResultAsJson = False,
+    lifetimes: Annotated[Path | None, option("Lifetimes by class.", hidden=True)] = None,
+) -> None:
+    """Write a file of Nav2."""
+    from evermap.survival.durations import parse_duration_s
+
+    ahead_s = parse_duration_s(ahead) if speed_mask else None
+    if p_least is None:
+        p_least = 0.0 if speed_mask or route_graph is not None else 0.5
+    write = _nav2_writer(out, cell_m, radius_m, ahead_s, route_graph)
+    _write_files(
+        file,
+        out,
+        write,
+        lifetimes,
+        revision=revision,
+        p_least=p_least,
+        up=up,
+        as_json=as_json,
+        inputs=[route_graph],
+    )
+
+
+def _write_files(
+    file: str,
+    out: Path | None,
+    write: Writer | None,
+    lifetimes: Path | None,
+    *,
+    revision: int | None,
+    p_least: float,
+    up: str | None,
+    as_json: bool,
+    inputs: Sequence[Path | None] = (),
+) -> None:
+    """Write landmarks by their writer, and lifetimes; and say so."""
     from evermap.existence.models import save_lifetimes
     from evermap.io.landmarks import up_dict
     from evermap.maps.learning import lifetimes_by_class
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
-    from evermap.survival.durations import parse_duration_s
 
-    if out is None and lifetimes is None:
-        raise ConfigError("nothing to write", field="--out", hint="--out map.geojson, or --lifetimes lifetimes.json")
-    ahead_s = parse_duration_s(ahead) if speed_mask else None
-    write = _writer(out, format_name, cell_m, radius_m, ahead_s, route_graph)
     for path in (out, lifetimes):
         if path is not None:
-            check_output_file(path, inputs=[file, route_graph], ending=".json" if path is lifetimes else "")
+            check_output_file(path, inputs=[file, *inputs], ending=".json" if path is lifetimes else "")
     with open_store(file) as store:
         number = store.head() if revision is None else revision
         living = store.load(number)
-    if p_least is None:
-        p_least = 0.0 if speed_mask or route_graph is not None else 0.5
     if up is not None:
         living = replace(living, up=_find_stated_up(up, living))
     landmarks = living.landmarks(p_least=p_least)
-    told = {"out": None if out is None else str(out), "landmarks": len(landmarks), **write(living, landmarks)}
+    written = {} if write is None else write(living, landmarks)
+    told = {"out": None if out is None else str(out), "landmarks": len(landmarks), **written}
     learned = {} if lifetimes is None else lifetimes_by_class(living)
     if lifetimes is not None:
         save_lifetimes(learned, lifetimes)
@@ -133,26 +194,18 @@ def export(
         closed = f"; {len(told['closed'])} of {told['edges']} edges are closed" if "edges" in told else ""
         say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}{closed}")
     if lifetimes is not None:
-        say(f"wrote lifetimes of {len(learned)} classes to {lifetimes}; use it with: evermap slam --prior {lifetimes}")
+        use = f"evermap map enter MAP INPUT --prior {lifetimes}"
+        say(f"wrote lifetimes of {len(learned)} classes to {lifetimes}; use it with: {use}")
 
 
-def _writer(
-    out: Path | None,
-    format_name: str | None,
-    cell_m: float,
-    radius_m: float | None,
-    ahead_s: float | None,
-    route_graph: Path | None,
-) -> Callable[[LivingMap, Landmarks], dict[str, Any]]:
-    """Return the writer for such a file, which returns facts for the summary.
+def _nav2_writer(
+    out: Path, cell_m: float, radius_m: float | None, ahead_s: float | None, route_graph: Path | None
+) -> Writer:
+    """Return the writer of such a file of Nav2, which returns facts for the summary.
 
     Raises:
-        ConfigError: no map is written to such a file.
+        ConfigError: it is not written to such a file.
     """
-    from evermap.io.map_formats import format_called, write_map
-
-    if out is None:
-        return lambda *_: {}
     ending = out.suffix.lower()
     if ahead_s is not None:
         if ending != ".yaml" or route_graph is not None:
@@ -162,15 +215,9 @@ def _writer(
         if ending not in (".geojson", ".json"):
             raise ConfigError("is written as GeoJSON", path=out, field="--route-graph", hint="--out open.geojson")
         return partial(_write_route_graph, out, route_graph, 0.5 if radius_m is None else radius_m)
-    if format_name is None and ending == ".yaml":
-        return partial(_write_grid, out, cell_m, 0.25 if radius_m is None else radius_m)
-    kind = format_called(format_name, out)
-
-    def write(_: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
-        write_map(landmarks, out, kind)
-        return {"format": kind.name}
-
-    return write
+    if ending != ".yaml":
+        raise ConfigError("is an image with its YAML", path=out, field="--out", hint="--out keepout.yaml")
+    return partial(_write_grid, out, cell_m, 0.25 if radius_m is None else radius_m)
 
 
 def _find_stated_up(text: str, living: LivingMap) -> Up:

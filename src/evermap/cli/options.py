@@ -35,6 +35,8 @@ def argument(help_text: str, *, default: bool | str = True, **how: Any) -> Any:
     return typer.Argument(help=help_text, show_default=default, **how)
 
 
+MOST_WORKERS = 1024
+"""Of one command on one machine."""
 DEFAULT_STORE, STORE_VARIABLE = "evermap-maps", "EVERMAP_STORE"
 """Store of a server where none is named, and the environment variable that names another."""
 
@@ -47,26 +49,24 @@ Settings = Annotated[
 ShowConfig = Annotated[bool, option("--show-config", "Print the configuration in force as commented TOML and exit.")]
 AsJson = Annotated[bool, option("--json", "Print the summary as JSON.")]
 ResultAsJson = Annotated[bool, option("--json", "Print as JSON.")]
-MapFile = Annotated[str, argument("The map, as `evermap slam --map FILE` writes it.", metavar="FILE")]
+MapFile = Annotated[str, argument("The map, as `evermap map enter` writes it.", metavar="FILE")]
 AtRevision = Annotated[int | None, option("--revision", "Use this revision.", metavar="N", default="newest")]
 Force = Annotated[bool, option("--force", "Write into --out even if it holds other files; these are kept.")]
 UnknownIds = Annotated[
     bool, option("--unknown-ids", "Ignore the landmark ids of the detections; associate by geometry.")
 ]
-EmptyIds = Annotated[
-    bool, option("--empty-ids", "Associate detections with an empty landmark id by geometry; others keep theirs.")
-]
 Robot = Annotated[int | None, option("Robot of a recording that has several.", default=False)]
 Topics = Annotated[
-    Path | None, option("Settings file of the topics, as slam --init-bag writes it.", metavar="FILE", default=False)
+    Path | None, option("Settings file of the topics, as `evermap init bag` writes it.", metavar="FILE", default=False)
 ]
 TableOut = Annotated[Path | None, option("Folder for the results.", default="evermap-out/<input>")]
 Workers = Annotated[
-    int | None,
-    option("Processes here; 1 needs no Dask.", min=1, max=1024, default="one per core, if Dask is installed"),
-]
-Cluster = Annotated[
-    str | None, option("Dask scheduler whose workers do it.", metavar="tcp://HOST:PORT", default="none")
+    str | None,
+    option(
+        "Processes here, of which 1 needs no Dask; or the Dask scheduler whose workers do it.",
+        metavar="NUMBER|tcp://HOST:PORT",
+        default="one per core, if Dask is installed",
+    ),
 ]
 Priors = Annotated[
     list[str] | None,
@@ -77,14 +77,26 @@ Priors = Annotated[
     ),
 ]
 
-_OTHER_NAMES = {"class_priors": "prior", "class_speed_mps": "speed", "speeds_mps": "speed", "living": "map_file"}
+_OTHER_NAMES = {"class_priors": "prior", "cluster": "workers", "living": "map_file"}
 """Arguments of the core whose option has another name."""
 
 
-def one_of(workers: int | None, cluster: str | None) -> None:
-    """Refuse the combination of local processes and a cluster."""
-    if cluster is not None and workers is not None:
-        raise ConfigError("are the cluster's", field="workers", hint="leave out --workers, or --cluster")
+def workers_of(text: str | None) -> tuple[int | None, str | None]:
+    """Return the number of processes of `--workers`, or the address of a cluster.
+
+    Raises:
+        ConfigError: no process, too many, or neither a number nor an address.
+    """
+    if text is None or ":" in text:
+        return None, text
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if not 1 <= count <= MOST_WORKERS:
+        raise ConfigError(f"'{text}' is no number of processes", field="workers",
+                          hint=f"1 to {MOST_WORKERS}, or tcp://HOST:PORT of a Dask scheduler")  # fmt: skip
+    return count, None
 
 
 def configured(
@@ -103,7 +115,7 @@ def configured(
         settings: `section.key=value` each.
         values: what other options say, by key; None where an option was not given.
         within: section that keys without a dot are of; others but it and `also` are not read.
-        also: further sections that the command reads.
+        also: further sections that the command reads, or keys, as 'output.rerun'.
         show: print the configuration and exit.
 
     Raises:
@@ -113,8 +125,17 @@ def configured(
 
     config = load_config(path, settings or [], values, within=within)
     reads = {within.partition(".")[0], *also}
-    others = [name for name in Config.model_fields if name not in reads] if within else []
-    refuse_unread(settings or [], {"by this command": others}, within=within)
+    parts = {one.partition(".")[0] for one in also if "." in one}  # of a section some keys are read
+    unread = [
+        *(name for name in Config.model_fields if name not in reads | parts),
+        *(
+            f"{name}.{one}"
+            for name in parts
+            for one in type(getattr(config, name)).model_fields
+            if f"{name}.{one}" not in reads
+        ),
+    ]
+    refuse_unread(settings or [], {"by this command": unread if within else []}, within=within)
     if show:
         typer.echo(to_toml(config), nl=False)
         raise typer.Exit
@@ -126,13 +147,6 @@ def refuse_given(problem: str, hint: str, **given: object) -> None:
     for field, value in given.items():
         if value is not None and value != []:
             raise ConfigError(problem, field=field, hint=hint)
-
-
-def associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
-    """Return `slam.unknown_ids` as the two flags have it."""
-    if unknown_ids and empty_ids:
-        raise ConfigError("ignores the ids that --empty-ids keeps", field="unknown-ids", hint="one of the two")
-    return True if unknown_ids else "empty" if empty_ids else None
 
 
 def priors_by_class(texts: Sequence[str] | None) -> tuple[str | None, dict[str, str] | None]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from evermap.cli.options import (
     AsJson,
-    Cluster,
     ConfigFile,
     Force,
     Priors,
@@ -21,12 +20,11 @@ from evermap.cli.options import (
     argument,
     configured,
     default_out,
-    duration_s,
-    one_of,
     option,
     priors_by_class,
+    workers_of,
 )
-from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
+from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, warm_up, warn
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,32 +44,10 @@ Looks = Annotated[
     Path | None,
     argument("Table of looks: .csv, .csv.gz or .parquet, or a folder of .parquet.", metavar="INPUT", default=False),
 ]
-Recurrent = Annotated[
-    str | None, option("How features return: none, auto, or a kind of model to learn.", metavar="KIND", default="none")
-]
-Per = Annotated[
-    str | None, option("Which features share a learned model.", metavar="all|class|feature", default="by the table")
-]
-Model = Annotated[Path | None, option("Model learned by an earlier run (its model.json).", metavar="FILE")]
-LearnFrom = Annotated[int | None, option("Maximum number of looks that --recurrent learns from.", default="100000")]
-Query = Annotated[
-    str | None, option("Beliefs at the times of the rows, or at regular times.", metavar="times|grid", default="times")
-]
-Step = Annotated[float | None, option("Step of the grid and of the forecasts [s].", default="chosen")]
-Horizon = Annotated[
-    str | None,
-    option("--horizon", "How far to forecast, as 3d.", metavar="DURATION", default="a quarter of the looks' span"),
-]
-PMiss = Annotated[float | None, option("P(no detection | there) if the table has no p_miss.", default="0.1")]
-PFalse = Annotated[float | None, option("P(detection | not there) if the table has no p_false.", default="0.1")]
-Confidence = Annotated[float | None, option("Belief above which a change is reported.", default="0.9")]
 TruthTable = Annotated[
     Path | None, option("Table with stamp_s, feature_id, present, to score the beliefs.", metavar="FILE")
 ]
-Figures = Annotated[int | None, option("Number of features with an individual figure.", min=0, default="12")]
 ShownClock = Annotated[StampsCount | None, option("Clock of the stamps, for the figures.", default="by their size")]
-Example = Annotated[Path | None, option("Write a commented example table and exit.", metavar="FILE", default=False)]
-
 
 HELP = """\
 Estimate which features still exist, from detections and misses.
@@ -82,18 +58,28 @@ p_miss, p_false, class_id, and the truth as present. The folder gets beliefs.csv
 summary.json, figures and report.html.
 
 \b
-Features that return need --recurrent:
+Features that return need --set recurrent=KIND:
   two-state                               stays and absences without typical duration
   phase-type, phase-type-rhythm           brief and long ones; with the hours of the local week
   run-length, run-length-rhythm           any typical duration; with the hours of the local week
   auto                                    the one that predicts held-out looks best
 
 \b
+Most useful with --set:
+  per=class               which features share a learned model: all, class, feature
+  model=model.json        a model of `evermap survival learn` or `fit` in place of learning one
+  p_miss=0.1              P(no detection | there) if the table has no p_miss; p_false=0.1 is P(detection | not there)
+  confidence=0.9          belief above which a change is reported
+  query=grid              beliefs at regular times, step_s=60 apart [s], not at those of the rows
+  horizon_s=259200        how far to forecast [s]; by default a quarter of the looks' span
+  figures=12              number of features with an individual figure
+
+\b
 Examples:
-  evermap persist --init looks.csv
+  evermap init looks looks.csv
   evermap persist looks.csv --out out/looks
-  evermap persist looks.csv --prior unknown:1h..1y --prior cart=exponential:half-life=1d --horizon 2d
-  evermap persist looks.csv --recurrent auto
+  evermap persist looks.csv --prior unknown:1h..1y --prior cart=exponential:half-life=1d --set horizon_s=172800
+  evermap persist looks.csv --set recurrent=auto
   evermap persist a-year-of-looks/ --workers 4
 """
 
@@ -102,52 +88,31 @@ def persist(
     input: Looks = None,
     out: TableOut = None,
     prior: Priors = None,
-    recurrent: Recurrent = None,
-    per: Per = None,
-    model: Model = None,
-    learn_from: LearnFrom = None,
-    query: Query = None,
-    step_s: Step = None,
-    horizon_s: Horizon = None,
-    p_miss: PMiss = None,
-    p_false: PFalse = None,
-    confidence: Confidence = None,
     truth: TruthTable = None,
-    figures: Figures = None,
     clock: ShownClock = None,
     workers: Workers = None,
-    cluster: Cluster = None,
     config: ConfigFile = None,
     settings: Settings = None,
     show_config: ShowConfig = False,
     as_json: AsJson = False,
     force: Force = False,
-    init: Example = None,
 ) -> None:
     """Filter a table of looks and write the folder of the run."""
-    if init is not None:
-        from evermap.runs.examples import write_looks
-
-        write_looks(init)
-        say(f"wrote an example to {init}; try: evermap persist {init}")
-        return
     common, by_class = priors_by_class(prior)
-    given = {"prior": common, "class_priors": by_class, "recurrent": recurrent, "per": per, "learn_from": learn_from,
-             "model": None if model is None else str(model), "query": query, "step_s": step_s, "p_miss": p_miss,
-             "horizon_s": duration_s(horizon_s, "horizon_s"), "p_false": p_false, "confidence": confidence,
-             "figures": figures}  # fmt: skip
+    given = {"prior": common, "class_priors": by_class}
     chosen = configured(config, settings, given, within="persist", show=show_config).persist
     if prior and not chosen.stays_once:
-        raise ConfigError("a lifetime prior is for features that stay once", field="prior", hint="without --recurrent")
+        hint = "without --set recurrent and model"
+        raise ConfigError("a lifetime prior is for features that stay once", field="prior", hint=hint)
     if input is None:
-        raise ConfigError("a table is needed", field="input", hint="--init looks.csv writes an example")
+        raise ConfigError("a table is needed", field="input", hint="evermap init looks looks.csv writes an example")
     from evermap.types import Clock
 
     out = out or default_out(input.name)
     inputs: list[str | Path | None] = [input, chosen.model, truth, config]
     counts = None if clock is None else Clock(clock.value)
-    one_of(workers, cluster)
-    spread: dict[str, Any] = {"workers": workers or 1, "cluster": cluster}
+    count, cluster = workers_of(workers)
+    spread: dict[str, Any] = {"workers": count or 1, "cluster": cluster}
     summary = _run(input, truth, chosen, out, clock=counts, force=force, inputs=inputs, spread=spread)
     if as_json:
         print_json(summary)

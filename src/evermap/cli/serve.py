@@ -335,7 +335,7 @@ def work(
 ) -> None:
     """Enter the sessions that were uploaded to a server.
 
-    By the code of `evermap slam --map`; as many workers as you like, on any machine that reaches the database.
+    By the code of `evermap map enter`; as many workers as you like, on any machine that reaches the database.
 
     \b
     Examples:

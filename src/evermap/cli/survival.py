@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evermap.cli.options import AsJson, ConfigFile, Settings, ShowConfig, argument, configured, duration_s, option
-from evermap.cli.persist import Per, PFalse, PMiss, Recurrent
 from evermap.cli.terminal import check_picture, print_json, print_table, progress_bar, say, warn, write_picture
 from evermap.errors import ConfigError
 
@@ -67,14 +66,14 @@ Estimators:
   pooled                                  what maps learn by: the same without a family, and without any end
 
 \b
-Every result is a prior: --json gives its text for `evermap persist --prior`, --out a file for --model.
+Every result is a prior: --json gives its text for `evermap persist --prior`, --out a file for `--set model=FILE`.
 In JSON, null stands for infinity: in support_right, for mass without an observed end.
 
 \b
 Examples:
   evermap survival fit lifetimes.csv --by class --figure survival.png --out priors.json
   evermap survival fit lifetimes.csv --by class,chunk --estimator best --json
-  evermap persist looks.csv --model priors.json
+  evermap persist looks.csv --set model=priors.json
 """
 LEARN = """\
 Learn the durations of stays and absences.
@@ -85,7 +84,7 @@ and scored on predicting it; the best is learned again from all looks.
 \b
 Example:
   evermap survival learn looks.csv --out model.json --figure model.png
-  evermap persist tomorrow.csv --model model.json
+  evermap persist tomorrow.csv --set model=model.json
 """
 
 app = typer.Typer(name="survival", help="How long features stay.", no_args_is_help=True, rich_markup_mode=None)
@@ -125,7 +124,8 @@ By = Annotated[
 Estimator = Annotated[str | None, option("Estimator, one of the list below.", metavar="NAME", default="npmle")]
 ChunkSide = Annotated[float | None, option("Side of the squares of --by chunk [m].", default="10")]
 PriorsFile = Annotated[
-    Path | None, option("File for the priors, for `evermap persist --model`.", metavar="FILE.json", default="none")
+    Path | None,
+    option("File for the priors, for `evermap persist --set model=FILE`.", metavar="FILE.json", default="none"),
 ]
 Curves = Annotated[Path | None, option("Draw the survival functions.", metavar="FILE.png", default="none")]
 
@@ -185,9 +185,19 @@ def fit(
     for group, one in zip(groups, found, strict=True):
         print_table(group.label if words else input.name, _lines(table, group, one))
     if out is not None:
-        say(f"written to {out}; use it with: evermap persist INPUT --model {out}")
+        say(f"written to {out}; use it with: evermap persist INPUT --set model={out}")
     if figure is not None:
         say(f"drawn in {figure}")
+
+
+Recurrent = Annotated[
+    str | None, option("How features return: none, auto, or a kind of model to learn.", metavar="KIND", default="none")
+]
+Per = Annotated[
+    str | None, option("Which features share a learned model.", metavar="all|class|feature", default="by the table")
+]
+PMiss = Annotated[float | None, option("P(no detection | there) if the table has no p_miss.", default="0.1")]
+PFalse = Annotated[float | None, option("P(detection | not there) if the table has no p_false.", default="0.1")]
 
 
 @app.command("learn", help=LEARN)
@@ -232,7 +242,7 @@ def learn(
         return
     for name, choice in zip(learned.models.names, learned.choices, strict=True):
         print_table(name or input.name, _learned_lines(choice))
-    say(f"written to {out}; use it with: evermap persist INPUT --model {out}")
+    say(f"written to {out}; use it with: evermap persist INPUT --set model={out}")
 
 
 def _keep(out: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[LifetimeEstimate]) -> None:

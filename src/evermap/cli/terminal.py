@@ -163,7 +163,12 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
 
 def command_line() -> str:
     """Return the command line, for the summary, without passwords in addresses."""
-    return re.sub(r"(://[^/\s:@]*):[^/\s@]*@", r"\1:***@", shlex.join(["evermap", *sys.argv[1:]]))
+    return hide_passwords(shlex.join(["evermap", *sys.argv[1:]]))
+
+
+def hide_passwords(text: str) -> str:
+    """Return a text without the passwords of addresses in it."""
+    return re.sub(r"(://[^/\s:@]*):[^/\s@]*@", r"\1:***@", text)
 
 
 def _console(*, stderr: bool = False) -> Console:

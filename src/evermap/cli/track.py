@@ -21,7 +21,7 @@ from evermap.cli.options import (
     option,
     priors_by_class,
 )
-from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
+from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, warm_up, warn
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,10 +34,6 @@ Seen = Annotated[
     ),
 ]
 Reach = Annotated[float | None, option("Range of the sensor [m]: misses within it are evidence.", default="unknown")]
-Speeds = Annotated[
-    list[str] | None,
-    option("Speed above which a class counts as moving [m/s]; repeatable.", metavar="CLASS=MPS", default="0.5 for all"),
-]
 Confusion = Annotated[
     Path | None,
     option(
@@ -46,12 +42,6 @@ Confusion = Annotated[
         default="5 % mistakes",
     ),
 ]
-MinScore = Annotated[float | None, option("Ignore detections with a lower score.", default="none")]
-Gap = Annotated[
-    float | None,
-    option("A longer time between two frames counts as a gap without looks [s].", default="ten times the usual"),
-]
-Scene = Annotated[bool, option("--scene/--no-scene", "Write scene.rrd for the rerun viewer.")]
 State = Annotated[
     Path | None,
     option(
@@ -60,7 +50,6 @@ State = Annotated[
         default="start afresh",
     ),
 ]
-Example = Annotated[Path | None, option("Write a commented example table and exit.", metavar="FILE", default=False)]
 
 HELP = """\
 Track objects in space, and learn how long they stay.
@@ -85,11 +74,15 @@ Most useful with --set:
   place_sigma_m=0.2       position tolerance of re-identification at rest, in addition to the noise [m]
   fov_deg=80              horizontal field of view; with --range-m and poses [deg]
   score_midpoint=3.7      score of a detection that is as likely real as false; score_scale=1.2 its slope
+  speeds_mps={pallet=0.2} speed above which objects of a class count as moving [m/s]
+  min_score=0.5           ignore detections with a lower score
+  gap_s=60                a longer time between two frames counts as a gap without looks [s]
+  output.rerun=true       write scene.rrd for the rerun viewer
   moved_reach_m=0         how far objects may be moved between looks; needs appearances [m]
 
 \b
 Examples:
-  evermap track --init detections.csv
+  evermap init detections detections.csv
   evermap track detections.csv --range-m 12 --out out/yard
   evermap track kitti_tracking/0000 --out out/0000
   evermap track tuesday.csv --range-m 12 --state yard.state --out out/tuesday
@@ -102,60 +95,29 @@ def track(
     out: TableOut = None,
     range_m: Reach = None,
     prior: Priors = None,
-    speed: Speeds = None,
     confusion: Confusion = None,
-    min_score: MinScore = None,
-    gap_s: Gap = None,
     state: State = None,
-    scene: Scene = False,
     config: ConfigFile = None,
     settings: Settings = None,
     show_config: ShowConfig = False,
     as_json: AsJson = False,
     force: Force = False,
-    init: Example = None,
 ) -> None:
     """Follow the objects of a table of detections and write the folder of the run."""
-    if init is not None:
-        from evermap.runs.examples import RANGE_M, write_detections
-
-        write_detections(init)
-        say(f"wrote an example to {init}; try: evermap track {init} --range-m {RANGE_M:g}")
-        return
     common, by_class = priors_by_class(prior)
-    given = {"range_m": range_m, "prior": common, "class_priors": by_class, "speeds_mps": _speeds(speed),
-             "min_score": min_score, "gap_s": gap_s}  # fmt: skip
-    chosen = configured(config, settings, given, within="track", show=show_config).track
+    given = {"range_m": range_m, "prior": common, "class_priors": by_class}
+    whole = configured(config, settings, given, within="track", also=("output.rerun",), show=show_config)
     if input is None:
-        raise ConfigError("a table is needed", field="input", hint="--init detections.csv writes an example")
+        hint = "evermap init detections detections.csv writes an example"
+        raise ConfigError("a table is needed", field="input", hint=hint)
     out = out or default_out(input.name)
     inputs = [input, confusion, config, state]
-    summary = _run(input, confusion, chosen, out, state=state, scene=scene, force=force, inputs=inputs)
+    scene = whole.output.rerun
+    summary = _run(input, confusion, whole.track, out, state=state, scene=scene, force=force, inputs=inputs)
     if as_json:
         print_json(summary)
     else:
         _show(summary, out)
-
-
-def _speeds(texts: Sequence[str] | None) -> dict[str, float] | None:
-    """Return the speeds of `CLASS=MPS` each.
-
-    Raises:
-        ConfigError: no speed, or a class named twice.
-    """
-    speeds: dict[str, float] = {}
-    for text in texts or []:
-        name, equals, value = (part.strip() for part in text.rpartition("="))
-        try:
-            speed = float(value)
-        except ValueError:
-            speed = -1.0
-        if not equals or not 0.0 < speed < float("inf"):
-            raise ConfigError(f"'{text}' is not CLASS=SPEED", field="speed", hint="pallet=0.2")
-        if name in speeds:
-            raise ConfigError(f"given twice for class '{name}'", field="speed")
-        speeds[name] = speed
-    return speeds or None
 
 
 def _run(

@@ -274,7 +274,7 @@ def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, wh
     try:
         reader = TomlReader(path.read_bytes(), path)
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path=path, hint="evermap slam --init-bag BAG") from None
+        raise InputError(f"cannot be read: {error.strerror}", path=path, hint="evermap init bag BAG") from None
     reader.expect(("bag", "camera", "measurements", "tags"), reader.document, section=None)
     given, measured = reader.section("bag", _TEXTS), reader.section("measurements", tuple(find_kinds()))
     for section, values in {"bag": given, "measurements": measured}.items():
@@ -338,10 +338,12 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         read = ", ".join(one.topic for one in settings.sensors.values())
         moved = f"odometry {settings.odometry}" if settings.odometry else "no odometry"
         more = "".join(f"; {kind} {topic}" for kind, topic in settings.measurements.items() if topic)
-        warnings.append(f"topics as guessed: detections {read}; {moved}{more} (`--init-bag` writes them for editing)")
+        warnings.append(
+            f"topics as guessed: detections {read}; {moved}{more} (`evermap init bag` writes them for editing)"
+        )
         for kind in (kind for kind, topic in settings.measurements.items() if not topic):
             some = ", ".join(topic for name, topic in content.measured if name == kind)
-            warnings.append(f"{kind} of several sensors not read: {some} (`--init-bag`, then [measurements])")
+            warnings.append(f"{kind} of several sensors not read: {some} (`evermap init bag`, then [measurements])")
     sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
     stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
@@ -457,7 +459,7 @@ def _tell_late(content: BagContent, settings: BagSettings, warnings: list[str]) 
         slow, fast = max(late, key=lambda one: late[one]), min(late, key=lambda one: late[one])
         warnings.append(
             f"messages of {slow} were recorded {late[slow] - late[fast]:.3g} s later, relative to their stamps, than "
-            f'those of {fast}: if their clocks differ, set clock = "receive" (`--init-bag`)'
+            f'those of {fast}: if their clocks differ, set clock = "receive" (`evermap init bag`)'
         )
 
 
@@ -474,7 +476,7 @@ def mounted_sensor(
     if not one.stated_mount:
         mount = content.mount(settings.base_frame, one.frame)
         if mount is None:
-            where = f"'{name}' is assumed at the robot's centre; state its mount (`--init-bag`)"
+            where = f"'{name}' is assumed at the robot's centre; state its mount (`evermap init bag`)"
             warnings.append(f"no fixed transform from '{settings.base_frame}' to '{one.frame}': {where}")
         sensor = replace(sensor, mount_robot_sensor=tuple((se3.identity() if mount is None else mount).tolist()))
     if sensor.intrinsics is not None or not one.camera_info:
@@ -489,7 +491,7 @@ def mounted_sensor(
         model = "pinhole"
     if model is None or len(used) > max(CAMERA_MODELS[model]) or not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
         problem = f"{one.camera_info} has an unknown camera model: '{info.distortion_model}'"
-        hint = "plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
+        hint = "plumb_bob or equidistant; rectified = true; or state it (`evermap init bag`)"
         raise InputError(problem, path=path, hint=hint)
     count = next(n for n in CAMERA_MODELS[model] if n >= len(used))
     return replace(
@@ -529,12 +531,12 @@ def _placed(
     cornered, aimed = np.isfinite(corner[:, 0, 0]), np.isfinite(pixel[:, 0])
     size = settings.rig.size_of(found.landmark_id)
     if (cornered & np.isnan(size)).all() and cornered.any():
-        hint = f"`evermap slam --init-bag {path}`, then [tags] with size_m in {settings_path(path).name}"
+        hint = f"`evermap init bag {path}`, then [tags] with size_m in {settings_path(path).name}"
         raise DataError("does not state the size of its tags", path=path, hint=hint)
     blind = np.array([one.intrinsics is None for one in sensors])[found.sensor] & (cornered | aimed)
     if blind.any():
         name = sensors[int(found.sensor[blind][0])].name
-        hint = "record its CameraInfo, or state its intrinsics (`--init-bag`)"
+        hint = "record its CameraInfo, or state its intrinsics (`evermap init bag`)"
         raise DataError(f"contains no calibration of the camera '{name}'", path=path, hint=hint)
     unturned = np.isnan(pose).any(axis=1) | ~(np.linalg.norm(pose[:, 3:], axis=1) > 1e-6)
     pose[unturned, 3:] = np.nan
@@ -575,7 +577,7 @@ def _odometry(
         turned = np.linalg.norm(rows[order, 3:7], axis=1) > 0.5
         bad["without orientation"], order = int((~turned).sum()), order[turned]
     if not len(order):
-        raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`--init-bag`)")
+        raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`evermap init bag`)")
     keep = order[np.append(np.diff(stamp_s[order]) > 0.0, True)]
     bad["with the stamp of the next"] = len(order) - len(keep)
     left_out = ", ".join(f"{count} {what}" for what, count in bad.items() if count)

@@ -15,7 +15,7 @@ from evermap.io.files import HEAD_BYTES, FileSet, head_of
 from evermap.io.rosbag import BAG_ENDINGS
 from evermap.io.text import parse_float
 
-_TO_NATIVE = "`evermap slam --init DIR` shows the tables of a recording"
+_TO_NATIVE = "`evermap init recording DIR` shows the tables of a recording"
 _AS_MAP = "`evermap slam RECORDING --prior-map FILE`"
 _MAKES_MAP = "`evermap slam`, which makes a map of a recording"
 _ONLY_POSES = "evermap needs detections of landmarks, too; as odometry it goes into odometry.csv: " + _TO_NATIVE
@@ -165,7 +165,7 @@ def _kind_of_database(path: Path) -> FileKind:
         tables = set()
     export = f"`evermap map export {path.name} --out map.csv`"
     if {"revision", "store"} <= tables:
-        hint = f"`evermap slam RECORDING --map {path.name}` enters a recording; `evermap map show {path.name}`"
+        hint = f"`evermap map enter {path.name} RECORDING` enters a recording; `evermap map show {path.name}`"
         return FileKind("a living map of evermap", hint, export)
     if {"topics", "messages"} <= tables:
         return FileKind("a bag of ROS 2 (SQLite) under another name", "rename it to NAME.db3", _MAKES_MAP)

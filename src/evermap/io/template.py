@@ -1,4 +1,4 @@
-"""Small, complete examples of the native format for `evermap slam --init`.
+"""Small, complete examples of the native format for `evermap init`.
 
 In the plane a robot goes three rounds by odometry that is a few per cent off, and a cart is not where an older map has
 it. In space a camera is carried around a room with tags on its walls.

@@ -277,7 +277,7 @@ class Inbox:
                 continue
             told = np.asarray(_column([] if values is None else values, len(names), quantity.name), dtype=np.float64)
             if column == 2 and np.isnan(told).any():
-                raise InputError(RANGE_ONLY, field=quantity.name, hint="a recording: evermap slam --map")
+                raise InputError(RANGE_ONLY, field=quantity.name, hint="a recording: evermap map enter")
             quantity.check_array(told, quantity.name)
             rows[:, column] = told
         return rows

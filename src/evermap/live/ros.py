@@ -163,7 +163,7 @@ class Listener:
             if now_s >= self._first_s + GUESS_S:
                 most = max(guessed.sensors, key=lambda one: len(self._content.stamps[guessed.sensors[one].topic]))
                 self.settings = replace(guessed, sensors={most: guessed.sensors[most]})
-                self._tell_settings("as guessed; evermap slam --init-bag writes what --topics reads")
+                self._tell_settings("as guessed; evermap init bag writes what --topics reads")
                 for one in guessed.sensors.keys() - {most}:
                     self._say(f"not read, since the engine has one sensor: {guessed.sensors[one].topic}")
                 return True

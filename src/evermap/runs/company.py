@@ -58,7 +58,7 @@ class Company(Shown):
         """
         names = tuple(sorted({name for site in sites for name in site.class_names}))
         if not names:
-            raise DataError("no map has a stay to learn from", hint="maps with sessions: evermap slam REC --map MAP")
+            raise DataError("no map has a stay to learn from", hint="maps with sessions: evermap map enter MAP INPUT")
         stay, absence = (np.stack(parts) for parts in zip(*(_aligned(site, names) for site in sites), strict=True))
         return cls(names, SitesPosterior.of(stay), SitesPosterior.of(absence, improper=True), tuple(sites))
 

@@ -1,4 +1,4 @@
-"""Small tables for `--init`: of looks for `evermap persist`, of detections for `evermap track`."""
+"""Small tables for `evermap init`: of looks for `evermap persist`, of detections for `evermap track`."""
 
 from __future__ import annotations
 

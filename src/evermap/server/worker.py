@@ -1,4 +1,4 @@
-"""Workers that enter waiting sessions by the same code as `evermap slam --map`, and the processes they run in."""
+"""Workers that enter waiting sessions by the same code as `evermap map enter`, and the processes they run in."""
 
 from __future__ import annotations
 

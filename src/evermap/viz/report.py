@@ -90,7 +90,7 @@ def _lead(summary: Mapping[str, Any]) -> str:
         f" of {counts['landmarks']:,} landmarks"
     )
     if counts["robot_sightings"]:
-        text += f"; {counts['robot_sightings']:,} sightings of other robots, used by --together"
+        text += f"; {counts['robot_sightings']:,} sightings of other robots, used by evermap together"
     return f"{text}.<br>Read from <code>{escape(source)}</code>." if source else f"{text}."
 
 

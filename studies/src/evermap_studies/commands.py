@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evermap.cli.moved import Moved
 from evermap.cli.terminal import print_json, progress_bar, say, warn
+from evermap.errors import ConfigError
 from evermap_studies.demo.command import demo
 
 if TYPE_CHECKING:
@@ -218,15 +220,12 @@ def nielsen2024(
             show_default=False,
         ),
     ] = None,
-    dataset: Annotated[
-        list[int] | None, typer.Option(help="Only this data set; repeatable.", show_default=False)
-    ] = None,
-    robot: Annotated[list[int] | None, typer.Option(help="Only this robot; repeatable.", show_default=False)] = None,
-    method: Annotated[list[str] | None, typer.Option(help="Only this method; repeatable.", show_default=False)] = None,
-    sensor: Annotated[
+    only: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this setting of sensor and modes: ours, paper, many-modes or paper-no-window; repeatable.",
+            metavar="dataset|robot|method|sensor=VALUE",
+            help="Only these data sets, robots, methods, or settings of sensor and modes (ours, paper, many-modes, "
+            "paper-no-window); repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -240,17 +239,40 @@ def nielsen2024(
 
     \b
     Example:
-      evermap reproduce nielsen2024 --part recordings --dataset 6 --method joint
+      evermap reproduce nielsen2024 --part recordings --only dataset=6 --only method=joint
     """
+    rows = _rows_of(only or [])
 
     def compute(target: Path, progress: Progress | None) -> tuple[dict[str, Any], AsText]:
         from evermap_studies.nielsen2024 import study
 
-        chosen = _given(parts=part, datasets=dataset, robots=robot, methods=method, sensors=sensor)
+        chosen = _given(parts=part, **rows)
         wanted = replace(study.QUICK if quick else study.Settings(), seed=seed, processes=jobs, **chosen)
         return study.reproduce(data, target, wanted, progress=progress, force=force), study.as_markdown
 
     _run("nielsen2024", compute, out, inputs=[data], as_json=as_json, force=force)
+
+
+ROWS = ("dataset", "robot", "method", "sensor")
+"""What rows of the tables of Nielsen 2024 are chosen by."""
+nielsen2024.moved = {  # type: ignore[attr-defined]
+    f"--{name}": Moved(key=name, write=str, option="--only") for name in ROWS
+}
+
+
+def _rows_of(only: list[str]) -> dict[str, list[Any]]:
+    """Return the chosen data sets, robots, methods and sensors.
+
+    Raises:
+        ConfigError: none of them, or a number is none.
+    """
+    rows: dict[str, list[Any]] = {}
+    for text in only:
+        name, _, value = text.partition("=")
+        if name not in ROWS or (name in ROWS[:2] and not value.isdecimal()):
+            raise ConfigError(f"'{text}' names no rows", field="--only", hint="dataset=6, method=joint")
+        rows.setdefault(f"{name}s", []).append(int(value) if name in ROWS[:2] else value)
+    return rows
 
 
 def bateman2020(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evermap.cli.moved import Moved
 from evermap.cli.terminal import print_json, say
 from evermap.errors import ConfigError, suggestion
 
@@ -17,10 +18,12 @@ if TYPE_CHECKING:
     from evermap_studies.worlds.yard import YardConfig
 
 BUILDING, STREET, YARD = WORLDS = ("building", "street", "yard")
-OF_BUILDINGS = ("patrol_s", "change_rate", "doors", "wing_opens_day", "clutter")
+OF_BUILDINGS = ("patrol_s", "change_rate", "wing_opens_day")
 """Options of buildings alone."""
-OF_YARDS = ("standing", "moving", "plane")
+OF_YARDS = ("moving",)
 """And of yards."""
+FEATURES = {"doors": BUILDING, "clutter": BUILDING, "standing": YARD, "plane": YARD}
+"""What `--with` adds, and to which world."""
 STAYS_FILE = "stays_truth.csv"
 BODIES_FILE = "bodies_truth.csv"
 EVENTS_FILE = "changes_truth.jsonl"
@@ -49,20 +52,22 @@ def simulate(
         ),
     ] = [165.0],  # noqa: B006
     change_rate: Annotated[float, typer.Option(min=0.0, help="How often things change; 0 is a static world.")] = 1.0,
-    doors: Annotated[
-        bool, typer.Option("--doors", help="Doors to the rooms, shut now and then; none sees through.")
-    ] = False,
     wing_opens_day: Annotated[
         int, typer.Option(min=0, help="The eastern wing is closed before this day, counted from 0; 0: no such wing.")
     ] = 0,
-    clutter: Annotated[
-        bool, typer.Option("--clutter", help="Add crates, many, that stay in one place for hours.")
-    ] = False,
     moving: Annotated[
         int, typer.Option(min=0, max=6, help="Forklifts of a yard, of six, that drive while the robot is there.")
     ] = 4,
-    standing: Annotated[bool, typer.Option("--standing", help="The same yard with nothing that moves.")] = False,
-    plane: Annotated[bool, typer.Option("--plane", help="The yard seen as ranges and bearings on the floor.")] = False,
+    with_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            metavar="|".join(FEATURES),
+            show_default=False,
+            help="Buildings: doors to the rooms, shut now and then; clutter, many crates that stay for hours. Yards: "
+            "standing, with nothing that moves; plane, seen as ranges and bearings on the floor. Repeatable.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
     force: Annotated[
         bool,
@@ -79,14 +84,14 @@ def simulate(
     without identity in space; stays_truth.csv has who stood where, from when until when.
 
     A yard has forklifts that carry tags, seen in space: some drive and stop while the robot is there, the others are
-    parked, elsewhere in each session; bodies_truth.csv has where each forklift was in each frame. With --plane the
+    parked, elsewhere in each session; bodies_truth.csv has where each forklift was in each frame. In a plane yard the
     same drives are recordings in the plane.
 
     \b
     Example:
       evermap simulate building --days 3 --seed 1
       evermap slam building/day00_session00
-      evermap simulate building out/hard --patrol-s 20 --patrol-s 60 --doors --wing-opens-day 3 --clutter
+      evermap simulate building out/hard --patrol-s 20 --patrol-s 60 --wing-opens-day 3 --with doors --with clutter
       evermap simulate street --days 3
       evermap simulate yard --moving 6
     """
@@ -99,6 +104,13 @@ def simulate(
         if source is not None and source.name == "COMMANDLINE":
             whose = "buildings" if name in OF_BUILDINGS else "yards"
             raise ConfigError(f"is for {whose}", field=f"--{name.replace('_', '-')}", hint="leave it out")
+    features = with_ or []
+    for name in features:
+        if name not in FEATURES:
+            raise ConfigError(f"no feature '{name}'", field="--with", hint=suggestion(name, FEATURES))
+        if FEATURES[name] != (world if world in WORLDS else BUILDING):
+            raise ConfigError(f"'{name}' is for {FEATURES[name]}s", field="--with", hint="leave it out")
+    doors, clutter, standing, plane = (name in features for name in FEATURES)
     if world in (STREET, YARD):
         if world == STREET:
             names = _write_street(where, days, sessions_per_day, seed, force=force)
@@ -113,7 +125,7 @@ def simulate(
         if as_json:
             print_json({"out": str(where), "sessions": names, "seed": seed})
         else:
-            say(f"wrote {len(names)} sessions to {where}; next: evermap slam {where / names[0]} --map {world}.map")
+            say(f"wrote {len(names)} sessions to {where}; next: evermap map enter {world}.map {where / names[0]}")
         return
     out = where
     from evermap.io import write_native
@@ -145,6 +157,11 @@ def simulate(
             f"wrote {len(names)} sessions and {len(building.events)} changes to {out}; "
             f"next: evermap slam {out / names[0]}"
         )
+
+
+simulate.moved = {  # type: ignore[attr-defined]
+    f"--{name}": Moved(takes=False, key=name, write=lambda _: "", option="--with") for name in FEATURES
+}
 
 
 def _write_street(out: Path, days: int, drives_per_day: int, seed: int, *, force: bool) -> list[str]:

@@ -52,12 +52,12 @@ def write(table: dict[str, Any], path: Path, files: int = 1) -> Path:
 
 
 def run(path: Path, out: Path, *more: str, figures: int = 0) -> Result:
-    return CliRunner().invoke(app, ["persist", str(path), "--out", str(out), "--figures", str(figures), *more])
+    return CliRunner().invoke(app, ["persist", str(path), "--out", str(out), "--set", f"figures={figures}", *more])
 
 
 def same(path: Path, folder: Path, *more: str, rows: int = 300, figures: int = 0) -> dict[str, Any]:
     """Run in one piece and in parts; every file must be the same, byte by byte; returns the summary."""
-    names = (*FILES, "model.json") if "--recurrent" in more else FILES
+    names = (*FILES, "model.json") if "recurrent=two-state" in more else FILES
     for out, at_once in (("one", 10**6), ("parts", rows)):
         assert is_parted(path, at_once) == (out == "parts")
         result = run(path, folder / out, *more, "--set", f"persist.rows_at_once={at_once}", figures=figures)
@@ -80,7 +80,7 @@ def same(path: Path, folder: Path, *more: str, rows: int = 300, figures: int = 0
 
 @pytest.mark.parametrize("query", ["times", "grid"])
 def test_in_parts_the_files_are_those_of_one_piece(tmp_path: Path, query: str) -> None:
-    told = same(write(looks(), tmp_path / "looks.parquet"), tmp_path, "--query", query, figures=2)
+    told = same(write(looks(), tmp_path / "looks.parquet"), tmp_path, "--set", f"query={query}", figures=2)
     assert told["counts"]["rows"] == 4000
     assert told["counts"]["vanished"] > 70
     assert any("returned" in remark for remark in told["warnings"])
@@ -99,7 +99,7 @@ def test_a_folder_of_files_is_one_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize("per", ["all", "auto"])
 def test_models_are_learned_from_the_same_looks(tmp_path: Path, per: str) -> None:
     path = write(looks(2, classes=per == "auto"), tmp_path / "looks.parquet")
-    more = ("--recurrent", "two-state", "--per", per, "--learn-from", "900")
+    more = ("--set", "recurrent=two-state", "--set", f"per={per}", "--set", "learn_from=900")
     told = same(path, tmp_path, *more)
     assert told["learning"]["per"] == ("class" if per == "auto" else "all")
     assert any("learned from at most 900" in remark for remark in told["warnings"])
@@ -138,7 +138,7 @@ def test_mistakes_are_one_line_with_the_row_of_the_whole_table(tmp_path: Path) -
     empty.mkdir()
     for words, arguments in {
         (":3211:", "p_miss", "looks.parquet"): (path, *small),
-        ("per", "one piece"): (few, "--recurrent", "two-state", "--per", "feature", *small),
+        ("per", "one piece"): (few, "--set", "recurrent=two-state", "--set", "per=feature", *small),
         ("is a folder",): (empty,),
     }.items():
         result = run(arguments[0], tmp_path / "out", *arguments[1:])  # type: ignore[arg-type]

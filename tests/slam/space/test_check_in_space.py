@@ -239,7 +239,7 @@ def test_a_mistake_is_refused_by_its_name_before_anything_enters_a_map(mistake: 
     spoil, _, words = MISTAKES[mistake]
     write_native(spoil(room()), tmp_path / "room")
     site = tmp_path / "site.evermap"
-    run = CliRunner().invoke(app, ["slam", str(tmp_path / "room"), "--map", str(site), "--out", str(tmp_path / "out")])
+    run = CliRunner().invoke(app, ["map", "enter", str(site), str(tmp_path / "room"), "--out", str(tmp_path / "out")])
     assert run.exit_code == 3
     assert re.search(words, run.output)
     with open_store(str(site)) as store:

@@ -217,7 +217,7 @@ def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
                 f"{recording.name}: begins at {start_s:.1f} s, before the newest session of the map, "
                 f"{living.session_start_s:.1f} s",
                 field="stamp_s",
-                hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it at its time",
+                hint="evermap.enter_session(store, recording), or evermap map enter, enter it at its time",
             )
     return living
 

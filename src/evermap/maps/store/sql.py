@@ -84,7 +84,7 @@ class SqlStore(Shown, MapStore):
         with self._transaction() as connection:
             version = read_schema_version(connection, where)
         if version == 0 and not create:
-            raise InputError("contains no map", path=where, hint="evermap slam INPUT --map FILE writes one")
+            raise InputError("contains no map", path=where, hint="evermap map enter FILE INPUT writes one")
         if version < schema.SCHEMA_VERSION:
             with self._transaction(writes=True) as connection:
                 version = read_schema_version(connection, where)  # somebody may have been faster

@@ -39,7 +39,7 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
     if path.is_dir():
         raise InputError("is a folder; a map is one file", path=path, hint=str(path / "map.evermap"))
     if not path.exists() and not create:
-        raise InputError("no such map", path=path, hint=f"evermap slam INPUT --map {path} starts one")
+        raise InputError("no such map", path=path, hint=f"evermap map enter {path} INPUT starts one")
     if not path.parent.is_dir():
         raise InputError(f"the folder {path.parent} does not exist", path=path, hint=f"mkdir -p {path.parent}")
     if path.is_file() and path.stat().st_size == 1:  # SQLite would take it for an empty one
