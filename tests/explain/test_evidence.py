@@ -4,14 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from evermap.estimate.graph import Border, Graph, Layout, Room, build_structure, grouped
 from evermap.estimate.sparse.system import exhausted
-from evermap.explain.evidence import LOG_2PI, DetectionTerms, Optimum, Screen, evidence_at
+from evermap.explain import scores
+from evermap.explain.causes import USUAL_P, Suspect
+from evermap.explain.evidence import (
+    LOG_2PI,
+    DetectionTerms,
+    Optimum,
+    ScalePrior,
+    Screen,
+    _in_own_room,
+    evidence_at,
+    price_scales,
+)
+from evermap.slam.room import ROOM_M
 
 N_POSES, N_PLACES = 6, 3
 
@@ -145,3 +158,83 @@ def test_the_variance_of_a_slope_is_by_residuals_before_or_after_its_step(proble
     best = -(with_all @ screen.residual) / (with_all @ with_all)
     after = (with_all * (screen.residual + best * with_all)) ** 2
     assert screen.variance(column, best) == pytest.approx(min(before.sum(), after.sum()), rel=1e-4)
+
+
+def optimum_with(problem: tuple, *scales: ScalePrior, worth: float = 1.0) -> tuple[Optimum, float, float]:
+    """Return the optimum of the problem with scales, what data say of the border, and its standard deviation."""
+    graph, dense, measured, information = problem
+    hessian = dense.T @ dense + np.diag(information)
+    state = np.linalg.solve(hessian, dense.T @ measured)
+    now = exhausted(graph.linearised(state))
+    empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
+    without = np.linalg.inv(hessian - np.diag(np.append(np.zeros(N_POSES + N_PLACES), 4.0)))
+    told = without @ dense.T @ measured  # without the prior of the border
+    return Optimum(graph, now, state, empty, 0.0, 0.0, worth, scales), float(told[-1]), float(without[-1, -1] ** 0.5)
+
+
+@pytest.mark.parametrize("worth", [1.0, 0.25])
+@pytest.mark.parametrize("stated", [0.0, 0.7, -30.0])
+def test_a_scale_has_the_density_of_what_is_meant_of_it(problem: tuple, stated: float, worth: float) -> None:
+    """As stated, as usual, or by a cause: whatever prior it was found with is taken off."""
+    state = optimum_with(problem)[0].state[-1]
+    scale = ScalePrior(0, float(state - stated), 0.2, 0.3, 5.0)
+    optimum, told, sigma = optimum_with(problem, scale, worth=worth)
+    meant, found = price_scales(optimum)
+    assert found == pytest.approx(norm(0.0, np.hypot(sigma, 0.5)).logpdf(told), rel=1e-9)
+    wider = sigma / worth**0.5
+    density = sum(
+        p * norm(0.0, np.hypot(wider, width)).pdf(told - stated)
+        for p, width in ((0.7, 0.0), (0.3, 0.2), (USUAL_P, 5.0))
+    )
+    assert meant == pytest.approx(np.log(density), rel=1e-6)
+
+
+def test_a_scale_that_is_held_is_as_stated(problem: tuple) -> None:
+    meant, found = price_scales(optimum_with(problem, ScalePrior(0, 0.0, 0.0, 0.3, 5.0))[0])
+    assert (meant, found) == (pytest.approx(np.log(0.7)), 0.0)
+    assert price_scales(optimum_with(problem)[0]) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_longer_metre_gives_places_no_room(dim: int) -> None:
+    """All places have the more room the longer lengths are: of each number so much is taken off again."""
+    random = np.random.default_rng(2)
+    pose, place = random.normal(size=(30, dim)) + 7.0, random.normal(size=(9, dim))
+    room = _in_own_room(pose, place)
+    assert _in_own_room(1.06 * pose, 1.06 * place) - room == pytest.approx(9 * dim * np.log(1.06))
+    everywhere = np.concatenate([pose, place])
+    extent = np.median(np.linalg.norm(everywhere - np.median(everywhere, axis=0), axis=1))
+    assert room == pytest.approx(9 * dim * np.log(extent / ROOM_M))
+    assert np.isfinite(_in_own_room(np.zeros((3, dim)), np.zeros((2, dim))))
+
+
+def test_what_is_usual_of_odometry_is_marginalised(problem: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exactly, where all is linear; a state of the solution is marginalised already."""
+    graph, dense, measured, information = problem
+    held = graph.held.copy()
+    held[:N_POSES] = information[:N_POSES] = 1e-2
+    graph = Graph(graph.blocks, graph.structure, graph.border, held, graph.retract)
+    state = np.zeros(len(information))  # nothing pulls there but what was measured
+    now = exhausted(graph.linearised(state))
+    empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
+    optimum = Optimum(graph, now, state, empty, 0.0, 0.0, 1.0)
+    names = ("turn-bias", "turn-scale")
+    directions = np.random.default_rng(8).normal(size=(2, len(measured)))
+    widths = zip(names, (3.0, 8.0), strict=True)
+    usual = [Suspect(name, "odometry", 0.1, lambda one, _: one, str, str, sigma) for name, sigma in widths]
+
+    def list_usual(_: object, screen: Screen, __: object) -> list[scores._Usual]:
+        columns = [screen.column(one) for one in directions]
+        rows = zip(usual, directions, columns, strict=True)
+        return [scores._Usual(one, way, column, screen.pull(column)) for one, way, column in rows]
+
+    monkeypatch.setattr(scores, "_list_usual", list_usual)
+    monkeypatch.setattr(scores, "_is_state", lambda *_: False)
+    own = np.eye(len(measured)) + dense @ np.diag(1.0 / information) @ dense.T
+    sigma = scores.USUAL_SHARE * np.array([3.0, 8.0])
+    wider = own + (directions.T * sigma**2) @ directions
+    exact = multivariate_normal(cov=wider).logpdf(measured) - multivariate_normal(cov=own).logpdf(measured)
+    anything: Any = cast("Any", None)
+    assert scores.weigh_usual(anything, optimum, anything) == pytest.approx(float(exact), abs=1e-6)
+    monkeypatch.setattr(scores, "_is_state", lambda *_: True)
+    assert scores.weigh_usual(anything, optimum, anything) == 0.0

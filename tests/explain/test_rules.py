@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -14,8 +15,10 @@ from evermap.config import Config, SlamConfig
 from evermap.explain import competition, seeds, triggers
 from evermap.explain.answer import list_causes
 from evermap.explain.causes import Inputs, Suspect
+from evermap.explain.evidence import Score
 from evermap.explain.screens import FAR
-from evermap.explain.trial import Asked, Taken, Trial, _state_evidence, _with_last
+from evermap.explain.trial import Asked, Taken, Trial, _state_evidence, _with_last, with_information
+from evermap.types import Cause
 
 from .worlds import World
 
@@ -41,6 +44,8 @@ def test_what_is_not_new_counts_less_but_prices_count_whole() -> None:
     assert price < 0.0
     with_cause, without = trial(50.0 + price, one, worth=0.5), trial(0.0, worth=0.2)
     assert with_cause.beats(without) == pytest.approx(0.2 * 50.0 + price)
+    own = replace(without, evidence=-4.0, log_scales=-4.0)  # a scale that it found by itself
+    assert with_cause.beats(own) == pytest.approx(0.2 * 50.0 + price + 4.0)
 
 
 def test_two_of_a_kind_are_tried_and_none_twice() -> None:
@@ -115,6 +120,74 @@ def test_a_cause_names_what_explains_the_same_without_it() -> None:
     assert list_causes(best, [best, both], None)[0].instead == ""
     by_code = {one.code: one.instead for one in list_causes(both, [base, best, other, both], base)}
     assert by_code == {"tag-size": str(wheels.state), "odometry-scale": str(size.state)}
+
+
+def test_scales_that_a_solution_found_by_itself_are_causes_of_it() -> None:
+    """They share the probability of what undoes them, and lose that of what explains the same."""
+    nothing = SimpleNamespace(parameters=())
+    ranges, of_map = (Taken(suspect(code, subject), 0.05) for code, subject in (("range-scale", "sensor"), ("map", "")))
+    base, undone = trial(0.0, result=nothing), trial(-1.0, ranges, result=nothing)
+    other = trial(-0.5, of_map, result=nothing)
+    own = Cause("range-scale", "sensor", "ranges are long", 1.05, 0.01, 0.999)
+    found_own = {id(base): [own]}
+
+    def list_of(best: Trial[Any], weighed: list[Trial[Any]]) -> tuple[Cause, ...]:
+        return list_causes(best, weighed, base, lambda one: found_own.get(id(one), []))
+
+    (cause,) = list_of(base, [base, undone, other])
+    price = ranges.suspect.log_p
+    shares = np.exp([0.0, undone.beats(base), other.beats(base)])
+    assert price == of_map.suspect.log_p
+    assert cause.probability == pytest.approx((shares[0] + shares[1]) / shares.sum())
+    assert (cause.code, cause.instead) == ("range-scale", str(of_map.state))
+    (cause,) = list_of(other, [base, other])
+    assert (cause.code, cause.instead) == ("map", "ranges are long")
+    assert list_of(base, [base])[0].probability == 0.999  # by itself it is no surer than the state
+    found_own[id(undone)] = [own]
+    assert [one.message for one in list_of(undone, [base, undone])] == [str(ranges.state)]  # once
+
+
+@pytest.mark.parametrize(
+    ("own", "code", "gain", "wins"),
+    [
+        ((), "map-scale", 5.0, False),  # what is as stated is not left for so little
+        ((), "map-scale", 7.0, True),
+        (("range-scale",), "map-scale", 0.5, True),  # there is a cause either way
+        (("range-scale",), "map-scale", -0.5, False),
+        (("range-scale",), "range-scale", 5.0, False),  # the same one
+    ],
+)
+def test_a_cause_that_a_solution_has_is_left_for_one_that_is_likelier(
+    own: tuple[str, ...], code: str, gain: float, wins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`lead_nats` are for what is as stated: of two causes both have paid."""
+    asked, base = suspect(code, sigma=0.0), trial(0.0)
+    tried = trial(gain, Taken(asked, 0.0))
+    monkeypatch.setattr(competition, "_find_own", lambda *_: [SimpleNamespace(code=one) for one in own])
+    monkeypatch.setattr(competition, "list_suspects", lambda _: [asked])
+    monkeypatch.setattr(competition, "_is_metre_known", lambda _: True)
+    monkeypatch.setattr(competition, "_rank", lambda *_: [[(gain, asked, 0.0)]])
+    monkeypatch.setattr(competition, "solve_trial", lambda *_: tried)
+    monkeypatch.setattr(competition, "_relieves", lambda *_: True)
+    monkeypatch.setattr(competition, "find_symptoms", lambda *_: ())
+    anything = cast("Any", None)
+    found = competition._next_cause(base, anything, anything, SlamConfig(), anything, [base], ())
+    assert (found is tried) is wins
+
+
+def test_every_state_pays_for_how_well_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of a trial that lost, too, which is refined no further."""
+    one = suspect(sigma=0.3)
+    asked = trial(7.0, Taken(one, 0.6))
+    monkeypatch.setattr("evermap.explain.trial._find_step", lambda *_: Score(0.2, 100.0 / 0.3**2, 1.0))
+    found = with_information(asked, cast("Any", None))
+    assert found.evidence == pytest.approx(7.0 - math.log(10.0))
+    assert (found.taken[-1].state, found.taken[-1].information) == (0.6, 100.0 / 0.3**2)
+    assert with_information(found, cast("Any", None)) is found
+    discrete = trial(7.0, Taken(suspect(sigma=0.0), 0.0))
+    assert with_information(discrete, cast("Any", None)) is discrete
+    monkeypatch.setattr("evermap.explain.trial._find_step", lambda *_: None)
+    assert with_information(asked, cast("Any", None)) is asked
 
 
 def ranked(plain: Asked, linear: Asked, *, best: Trial[Any] | None) -> list[list[str]]:

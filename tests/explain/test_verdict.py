@@ -81,6 +81,25 @@ def test_a_cause_that_another_may_hold_instead_of_is_weak_and_names_both() -> No
     assert judge_signs(GOOD, causes=[replace(size, probability=SURE)]).kind is VerdictKind.SENSOR_SUSPECT
 
 
+def test_a_scale_that_another_cause_may_be_is_no_suspicion() -> None:
+    """What is said of it is which of the two it may be, and what decides."""
+    recording, survey = recorded()
+    result = run_slam(recording, prior_map=survey)
+    slope = next(one for one in result.parameters if one.name == "range_slope")
+    far = replace(slope, value=0.03, fixed=False, prior_mean=0.0, prior_sigma=0.0002)
+    others = tuple(one for one in result.parameters if one.name != "range_slope")
+    cause = Cause("range-scale", "sensor", "ranges are short", probability=0.6, instead="the map is long")
+
+    def kind_of(one: Cause) -> VerdictKind:
+        changed = replace(result, parameters=(*others, far), causes=(one,))
+        return verdict.judge(changed, recording, SlamConfig(), survey).kind
+
+    assert kind_of(cause) is VerdictKind.WEAK
+    assert kind_of(replace(cause, probability=SURE)) is VerdictKind.SENSOR_SUSPECT
+    assert kind_of(replace(cause, instead="")) is VerdictKind.SENSOR_SUSPECT
+    assert kind_of(replace(cause, code="clock")) is VerdictKind.SENSOR_SUSPECT
+
+
 def test_a_delay_that_the_estimator_put_right_is_no_suspicion() -> None:
     late = Cause("clock", "front", "stamps of front are 0.12 s late", 0.12, 0.002, 0.99, "stamp_s - 0.12")
     found = judge_signs(GOOD, causes=[late])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -63,32 +63,61 @@ def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     return state, sigma
 
 
-def _say(trial: Trial[VisitT]) -> str:
-    """Return the causes of a trial in words."""
-    return "; ".join(one.suspect.say(_with_own_state(one, trial.solution.result)[0]) for one in trial.taken)
+def _say(trial: Trial[VisitT], own: Sequence[Cause]) -> str:
+    """Return the causes of a trial in words: those that it was solved under, and its own scales."""
+    taken = [one.suspect.say(_with_own_state(one, trial.solution.result)[0]) for one in trial.taken]
+    undone = {one.suspect.code for one in trial.taken}
+    return "; ".join([*taken, *(one.message for one in own if one.code not in undone)])
 
 
-def list_causes(best: Trial[VisitT], weighed: list[Trial[VisitT]], base: Trial[VisitT] | None) -> tuple[Cause, ...]:
-    """Return the causes of the best trial, with their probabilities among all that was weighed."""
-    if not best.taken:
+def list_causes(
+    best: Trial[VisitT],
+    weighed: list[Trial[VisitT]],
+    base: Trial[VisitT] | None,
+    find_own: Callable[[Trial[VisitT]], Sequence[Cause]] = lambda _: (),
+) -> tuple[Cause, ...]:
+    """Return the causes of the best trial, with their probabilities among all that was weighed.
+
+    Args:
+        best: the trial that won.
+        weighed: all.
+        base: that of the inputs as given; None without.
+        find_own: causes of a trial that are calibration states of it, as scales are: they are of the best, too.
+    """
+    if not weighed:
         return ()
     relative = np.array([trial.beats(best) for trial in weighed])
     share = np.exp(np.minimum(relative, 0.0))
     share /= max(float(share.sum()), 1e-300)
+    own = [find_own(trial) for trial in weighed]
+    named = [
+        {(one.suspect.code, one.suspect.subject) for one in trial.taken} | {(one.code, one.subject) for one in scales}
+        for trial, scales in zip(weighed, own, strict=True)
+    ]
+
+    def weigh(name: tuple[str, str]) -> tuple[float, str]:
+        """Return the probability of a cause, and the words for the best trial without it."""
+        holds = np.array([name in names for names in named])
+        other = None if holds.all() else int(np.argmax(np.where(holds, -math.inf, relative)))
+        return float(share[holds].sum()), "" if other is None else _say(weighed[other], own[other])
+
     found = []
     gained = math.nan if base is None else best.beats(base)
     for one in best.taken:
-        name = one.suspect.code, one.suspect.subject
-        holds = np.array([any((t.suspect.code, t.suspect.subject) == name for t in trial.taken) for trial in weighed])
-        other = None if holds.all() else weighed[int(np.argmax(np.where(holds, -math.inf, relative)))]
         suspect = one.suspect
+        p, instead = weigh((suspect.code, suspect.subject))
         state, sigma = _with_own_state(one, best.solution.result)
         value = suspect.shown(state) if suspect.is_continuous else math.nan
         scale = abs(suspect.shown(state + 1e-6) - suspect.shown(state)) / 1e-6
         found.append(
             Cause(
                 suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
-                float(share[holds].sum()), suspect.fix(state), gained, "" if other is None else _say(other),
+                p, suspect.fix(state), gained, instead,
             )
         )  # fmt: skip
+    taken = {one.suspect.code for one in best.taken}
+    for cause in find_own(best):
+        if cause.code not in taken:
+            p, instead = weigh((cause.code, cause.subject))
+            found.append(replace(cause, probability=min(cause.probability, p), instead=instead))
     return tuple(sorted(found, key=lambda cause: -cause.probability))

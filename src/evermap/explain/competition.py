@@ -21,6 +21,7 @@ from evermap.explain.put_right import (
     add_late_sensor,
     add_put_right,
     find_late_sensor,
+    find_own_scales,
     find_put_right,
     find_turns_off,
     solve_at_true_stamps,
@@ -43,9 +44,10 @@ from evermap.explain.trial import (
     share_rejected,
     solve_trial,
     weigh_solution,
+    with_information,
 )
 from evermap.explain.triggers import CHANGES, SINGLE, find_symptoms
-from evermap.types import SlamResult, is_in_space
+from evermap.types import Cause, SlamResult, is_in_space
 
 REFINED = 2
 """Trials whose states are refined: the best ones."""
@@ -114,10 +116,15 @@ def explain(
             break
     if best is None:
         return None
-    causes = list_causes(best, weighed, base)
+    causes = list_causes(best, weighed, base, partial(_find_own, config=config))
     named = {cause.code for cause in causes}
     others = find_put_right(best.solution.result, best.inputs, config)
     return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
+
+
+def _find_own(trial: Trial[VisitT], config: SlamConfig) -> Sequence[Cause]:
+    """Return causes of a trial that it was not solved under: scales that are calibration states of it."""
+    return find_own_scales(trial.solution.result, trial.inputs, config.explain.states)
 
 
 def _next_cause(
@@ -141,6 +148,12 @@ def _next_cause(
     def ahead(trial: Trial[VisitT]) -> float:
         return trial.evidence if best is None else trial.beats(best)
 
+    own = set[str]() if best is None else {one.code for one in _find_own(best, config)}
+
+    def lead(trial: Trial[VisitT]) -> float:
+        """Return by how much a trial must lead: what is as stated is not left for a little, another cause is."""
+        return 0.0 if own and trial.taken[-1].suspect.code not in own else rules.lead_nats
+
     for ranked in _rank(best, inputs, suspects, config, screens):
         asked = _diverse(ranked, rules.most_tried, tried)
         made = (solve_trial(inputs, taken, suspect, state, solve_under, budget) for suspect, state in asked)
@@ -148,9 +161,10 @@ def _next_cause(
         for row, trial in enumerate(trials[:REFINED]):
             if best is None or ahead(trial) > 0.0:
                 trials[row] = refine(trial, inputs, taken, solve_under, budget)
+        trials = [with_information(trial, inputs) for trial in trials]
         weighed += trials
         for trial in trials:
-            if best is not None and not (ahead(trial) > rules.lead_nats and _relieves(trial, best, config)):
+            if best is not None and not (ahead(trial) > lead(trial) and _relieves(trial, best, config)):
                 continue  # it fits better, as with any further state, but nothing that was asked is explained
             if winner is None or trial.beats(winner) > 0.0:
                 winner = trial

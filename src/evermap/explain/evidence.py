@@ -25,12 +25,14 @@ import numpy as np
 
 from evermap.estimate.graph import Graph, Linear
 from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.explain.causes import SCALE, TURN, USUAL_P
 from evermap.slam import intake
+from evermap.slam.calibration import FORWARD, SLOPE
 from evermap.slam.changes.gain import PLANE, log_onset, log_prior
 from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
 from evermap.slam.linearise import PlacePriors, detection_residuals
-from evermap.slam.room import hold_in_room
+from evermap.slam.room import ROOM_M, hold_in_room
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.against_map import log_map_density
 from evermap.slam.space.intake import SpatialIntake, start_noise
@@ -42,10 +44,18 @@ from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 LOG_2PI = math.log(2.0 * math.pi)
 LEAST_INFORMATION = 1e-6
 """Information of the border's priors, at least: that on delays may be less than none."""
+LEAST_EXTENT_M = 1e-3
+"""Extent of a session, at least."""
+LEAST_TOLD = 1e-6
+"""Share of what is known of a scale that data say, from which they say anything."""
 TINY = 1e-3
 """Share of a step in which all is linear."""
 ODOMETRY, DETECTIONS, START, REST = 0, 1, 2, 3
 """Blocks of a graph, the same in the plane and in space."""
+TURN_STATE = 9
+"""The scale of turns among calibration states in the plane."""
+AS_USUAL = 0.5
+"""Probability beforehand that the odometry's scale in space is not as stated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +100,27 @@ class DetectionTerms(NamedTuple):
         return float(self.share @ loss)
 
 
+class ScalePrior(NamedTuple):
+    """What is meant of a scale that is a calibration state: it is as stated, or as is usual, or a cause has changed it.
+
+    The prior that a solution was found with says less: its mean and width are chosen so that the estimate is the mean
+    over the first two (`slam.calibration.narrowed`), and wide enough for a map in another metre.
+
+    Attributes:
+        row: number of the border.
+        off: its value, from what is stated.
+        sigma: standard deviation where it is as is usual; 0 of a scale that is held as stated.
+        p_needed: probability beforehand that it is not as stated.
+        of_cause: standard deviation where a cause has changed it.
+    """
+
+    row: int
+    off: float
+    sigma: float
+    p_needed: float
+    of_cause: float
+
+
 @dataclass(frozen=True, slots=True)
 class Optimum:
     """The graph of a session at its optimum, and what its evidence needs beside it.
@@ -102,7 +133,8 @@ class Optimum:
         log_priors: logarithms of the densities of all priors but the border's where they are highest, and of the
             odometry's.
         log_prices: log prior probability of all changes that the solution has.
-            worth: share of what detections say that is new, given that errors last.
+        worth: share of what detections say that is new, given that errors last.
+        scales: numbers of the border that causes are of, too, and what is meant of them.
     """
 
     graph: Graph[Any]
@@ -112,6 +144,7 @@ class Optimum:
     log_priors: float
     log_prices: float
     worth: float
+    scales: tuple[ScalePrior, ...] = ()
 
 
 def log_evidence(session: AnySession, changes: tuple[MapChange, ...] = ()) -> float:
@@ -132,6 +165,39 @@ def log_volume(graph: Graph[Any], now: Linear) -> float:
     border = 0.5 * float(np.log(information).sum()) - 0.5 * len(information) * LOG_2PI
     count = int(graph.structure.layout.dim.sum())
     return border + 0.5 * count * LOG_2PI - 0.5 * exhausted(graph.factorised(now)).log_determinant
+
+
+def price_scales(optimum: Optimum) -> tuple[float, float]:
+    """Return log densities of what is found of scales, by what is meant of them, and by the solution's prior [nats].
+
+    What data say of a scale is its posterior without that prior, all else marginalised: `off` from what is stated, with
+    a standard deviation that is added to each prior's. A scale that is far from what is usual has the density, and pays
+    the prior odds, of the cause that it is: as an alternative does that undoes the cause.
+    """
+    graph, meant, found = optimum.graph, 0.0, 0.0
+    if not optimum.scales:
+        return meant, found
+    variance = np.diag(np.linalg.inv(exhausted(graph.factorised(optimum.now)).information))
+    offset, prior = graph.border.offset(optimum.state), graph.border.information
+    for row, off, sigma, p_needed, of_cause in optimum.scales:
+        free = 1.0 - variance[row] * prior[row]  # share of what is known that is no prior's
+        if sigma == 0.0 or not 1.0 >= free > LEAST_TOLD:
+            meant += math.log(max(1.0 - p_needed, LEAST_TOLD))
+            continue
+        own = variance[row] / free
+        told, stated = own / max(optimum.worth, LEAST_TOLD), (off - offset[row]) + offset[row] / free
+        parts = [
+            math.log(p) + _log_normal(stated, told + width**2)
+            for p, width in ((1.0 - p_needed, 0.0), (p_needed, sigma), (USUAL_P, max(of_cause, sigma)))
+            if p > 0.0
+        ]
+        meant += float(np.logaddexp.reduce(parts))
+        found += _log_normal(offset[row] / free, own + 1.0 / prior[row])
+    return meant, found
+
+
+def _log_normal(off: float, variance: float) -> float:
+    return -0.5 * (off**2 / variance + math.log(variance) + LOG_2PI)
 
 
 def used_rows(session: AnySession) -> IntArray:
@@ -170,11 +236,33 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
             log_priors += float(np.log(size).sum()) - 0.5 * len(size) * LOG_2PI
     held, count, in_room = hold_in_room(graph, n + np.flatnonzero(free))
     log_priors += in_room - 0.5 * count * LOG_2PI
+    log_priors -= _in_own_room(state.pose[:, :2], state.landmark[state.known])
     table = solved.settings.changes
     prices = sum(_price(change, len(problem.landmark_mean), PLANE, log_prior, table) for change in changes)
     log_priors += _odometry_peak(graph, now, 3, slice(3, 6))
     worth = _worth(smoother.lasting(state), problem.stamp_s[problem.pose_row], problem.landmark_row)
-    return Optimum(held, now, state, seen, log_priors, prices, worth)
+    return Optimum(held, now, state, seen, log_priors, prices, worth, _scales_in_plane(solved))
+
+
+def _scales_in_plane(solved: Solved) -> tuple[ScalePrior, ...]:
+    """Return what is meant of scales in the plane; without a map that of the odometry is of the ranges, too."""
+    outcome = solved.outcome
+    meant = outcome.prior if outcome.aligned else outcome.prior.without_scale()
+    free, off = outcome.problem.prior.free & meant.free, outcome.graph_estimate.states - meant.mean
+    return tuple(
+        ScalePrior(row, float(off[row]), float(meant.sigma[row]) * free[row], float(meant.p_needed[row]), of_cause)
+        for row, of_cause in ((SLOPE, SCALE), (FORWARD, SCALE), (TURN_STATE, TURN))
+    )
+
+
+def _scales_in_space(session: SpatialSession, count: int) -> tuple[ScalePrior, ...]:
+    """Return what is meant of the scale of odometry, in space, which is the last of the border's numbers (`count`)."""
+    problem, given = session.solved.optimum.smoother.problem, session.intake
+    sigma = given.problem.scale_sigma or given.scale_in_map
+    if not sigma > 0.0:
+        return ()
+    off = session.solved.optimum.estimate.log_scale + problem.odometry_log + problem.ranges_log
+    return (ScalePrior(count - 1, float(off), sigma * (problem.scale_sigma > 0.0), AS_USUAL, SCALE),)
 
 
 def _in_space(session: SpatialSession) -> Optimum:
@@ -196,12 +284,26 @@ def _in_space(session: SpatialSession) -> Optimum:
     free[problem.prior.place] = False
     held, count, in_room = hold_in_room(graph, n + np.flatnonzero(free))
     log_priors += in_room - 0.5 * count * LOG_2PI
+    log_priors -= _in_own_room(state.pose[:, :3], state.place[:, :3])
     if problem.driven:
         log_priors += _odometry_peak(graph, now, 6, slice(6, 12))
     twice = int((session.solved.number > 1).sum())  # one identity at two places
     prices += twice * math.log(problem.settings.map.p_moved)
     worth = _worth(smoother.lasting(linear), problem.stamp_s[problem.pose_row], problem.place)
-    return Optimum(held, now, state, seen, log_priors + extra, prices, worth)
+    scales = _scales_in_space(session, len(held.border.information))
+    return Optimum(held, now, state, seen, log_priors + extra, prices, worth, scales)
+
+
+def _in_own_room(pose: FloatArray, place: FloatArray) -> float:
+    """Return the log volume of the room in which places (L, D) are seen from poses (N, D), over that of `ROOM_M`, once
+    for each place.
+
+    Nothing but what is stated says what a metre is. In a room of so many metres there would be more room for places the
+    longer all lengths are said to be, and of causes that make them so the longest would win.
+    """
+    at = np.concatenate([pose, place])
+    extent_m = float(np.median(np.linalg.norm(at - np.median(at, axis=0), axis=1)))
+    return place.size * math.log(max(extent_m, LEAST_EXTENT_M) / ROOM_M)
 
 
 def _log_peaks(problem: SpatialProblem, level: FloatArray) -> FloatArray:

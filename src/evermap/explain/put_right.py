@@ -126,7 +126,7 @@ def find_put_right(result: SlamResult, inputs: Inputs, config: SlamConfig) -> tu
     return (
         *_find_other_map(result, inputs, are_named=config.unknown_ids is not True),
         *_find_delays(result, config.explain.late_s),
-        *_find_own_scales(result, inputs, config.explain.states),
+        *find_own_scales(result, inputs, config.explain.states),
     )
 
 
@@ -148,7 +148,7 @@ def _find_other_map(result: SlamResult, inputs: Inputs, *, are_named: bool) -> l
     return [Cause("map-site", "map", message, probability=1.0, fix="--prior-map: the map of this site")]
 
 
-def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
+def find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> list[Cause]:
     """Return scales that are calibration states, so many of their prior's standard deviations from what is stated."""
     far = {state.name: state for state in result.parameters if _is_far_off(state, farthest)}
     if not any(name in far for own in OWN_STATES.values() for name, _ in own):
@@ -160,6 +160,8 @@ def _find_own_scales(result: SlamResult, inputs: Inputs, farthest: float) -> lis
                 continue
             state = far[name]
             ratio = find_ratio(state)
+            if not ratio > 0.0:  # a sign, and no scale
+                continue
             log, sigma = sign * math.log(ratio), state.sigma / ratio
             value, p = suspect.shown(log), min(state.p_needed, 1.0)
             found.append(Cause(code, suspect.subject, suspect.say(log), value, sigma * value, p, suspect.fix(log)))

@@ -251,6 +251,29 @@ def score_odometry(session: AnySession, inputs: Inputs) -> tuple[CalibrationScor
     return tuple(found)
 
 
+def weigh_usual(session: AnySession, optimum: Optimum, inputs: Inputs) -> float:
+    """Return by how much the log evidence of a solution is larger with what is usual of odometry marginalised [nats].
+
+    Of what is no state of it, as turns in space: held as stated they would count against a cause that they look like.
+    By what is linear at the optimum (MATH.md, section 8).
+
+    Args:
+        session: the solution.
+        optimum: of it.
+        inputs: of which it is the solution.
+    """
+    try:
+        screen = Screen.of(optimum)
+        usual = [one for one in _list_usual(session, screen, inputs) if not _is_state(session, one.suspect)]
+    except EvermapError:
+        return 0.0
+    if not usual:
+        return 0.0
+    known, pull = _find_shared(usual, USUAL_SHARE), np.array([one.pull for one in usual])
+    volume = np.linalg.slogdet(known)[1] + 2.0 * sum(math.log(USUAL_SHARE * one.suspect.sigma) for one in usual)
+    return float(0.5 * pull @ np.linalg.solve(known, pull) - 0.5 * volume)
+
+
 def _list_usual(session: AnySession, screen: Screen, inputs: Inputs) -> list[_Usual]:
     """Return what is usual of odometry, at a solution."""
     found = list[_Usual]()

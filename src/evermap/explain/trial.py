@@ -11,9 +11,18 @@ import numpy as np
 
 from evermap.errors import EvermapError
 from evermap.explain.causes import Inputs, Suspect
-from evermap.explain.evidence import LOG_2PI, AnySession, Score, Screen, evidence_at, optimum_of, used_rows
+from evermap.explain.evidence import (
+    LOG_2PI,
+    AnySession,
+    Score,
+    Screen,
+    evidence_at,
+    optimum_of,
+    price_scales,
+    used_rows,
+)
 from evermap.explain.linearise import change_by, held_by_map
-from evermap.explain.scores import score_session
+from evermap.explain.scores import score_session, weigh_usual
 from evermap.slam.estimate import Solved
 from evermap.slam.room import ROOM_M
 from evermap.types import Cause, SlamResult
@@ -60,6 +69,7 @@ class Trial(Generic[VisitT]):
         evidence: log evidence of the measurements as given, with the prices of all causes and changes.
         worth: share of what the measurements say that is new.
         noise: largest level of the noise of detections, over what is stated of it.
+        log_scales: log prior density of the scales that it found by itself, which no errors that last make less.
     """
 
     inputs: Inputs
@@ -68,13 +78,14 @@ class Trial(Generic[VisitT]):
     evidence: float
     worth: float
     noise: float = 1.0
+    log_scales: float = 0.0
 
     def beats(self, other: Trial[VisitT]) -> float:
         """Return by how much the evidence is larger, as far as measurements are independent [nats].
 
         A solution that ignores a sensor explains nothing of it: one that does not wins.
         """
-        own, others = (sum(one.suspect.log_p for one in trial.taken) for trial in (self, other))
+        own, others = (sum(one.suspect.log_p for one in trial.taken) + trial.log_scales for trial in (self, other))
         price = own - others
         if max(self.noise, other.noise) > IGNORED and min(self.noise, other.noise) < HEARD:
             return (IGNORED_NATS if self.noise < other.noise else -IGNORED_NATS) + price
@@ -193,6 +204,17 @@ def refine(
     return trial
 
 
+def with_information(trial: Trial[VisitT], before: Inputs) -> Trial[VisitT]:
+    """Return the trial with the information on the state of its last cause, which is the price of that; as it is where
+    it was asked, or can't be.
+    """
+    last = trial.taken[-1]
+    if not last.suspect.is_continuous or math.isfinite(last.information):
+        return trial
+    step = _find_step(trial, before)
+    return trial if step is None else _with_last(trial, replace(last, information=step.information))
+
+
 def _find_step(trial: Trial[VisitT], before: Inputs) -> Score | None:
     """Return what the state of the last cause of a trial does with the map as given, or with what was let go of it:
     of either, what knows more of it; None if it changes what is used.
@@ -248,4 +270,6 @@ def weigh_solution(inputs: Inputs, solution: SessionSolution[VisitT], taken: tup
     anywhere = inputs.left_out if solution.result.trajectory.frame == "prior_map" else inputs.left_out + inputs.n_common
     evidence -= anywhere * inputs.recording.dim * (math.log(ROOM_M) + 0.5 * LOG_2PI)
     noise = max((one.value for one in solution.result.parameters if one.name.endswith(OF_NOISE[0])), default=1.0)
-    return Trial(inputs, solution, taken, evidence + sum(map(_state_evidence, taken)), optimum.worth, noise)
+    meant, found = price_scales(optimum)
+    evidence += meant - found + weigh_usual(session, optimum, inputs) + sum(map(_state_evidence, taken))
+    return Trial(inputs, solution, taken, evidence, optimum.worth, noise, meant)

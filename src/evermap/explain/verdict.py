@@ -13,13 +13,23 @@ from dataclasses import dataclass, replace
 from math import inf, isfinite, isnan, log
 
 from evermap.config import SlamConfig
+from evermap.explain.answer import OWN_STATES
 from evermap.explain.causes import Inputs
 from evermap.explain.evidence import AnySession
 from evermap.explain.scores import MOST_SHIFT, score_session
 from evermap.explain.symptoms import Signs, measure_signs, with_scores
 from evermap.slam.calibration import far_off
 from evermap.slam.mistakes import Finding
-from evermap.types import AnyRecording, Cause, Landmarks, SlamResult, Symptom, Verdict, VerdictKind
+from evermap.types import (
+    AnyRecording,
+    Cause,
+    Landmarks,
+    ParameterEstimate,
+    SlamResult,
+    Symptom,
+    Verdict,
+    VerdictKind,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,12 +248,19 @@ def judge(
     """
     signs = measure_signs(result, recording, prior_map, as_read)
     wrong = [finding.message for finding in findings if not finding.usable]
-    suspicions = [*wrong, *far_off(result.parameters, settings.check)]
+    suspicions = [*wrong, *far_off(_without_doubtful(result), settings.check)]
     found = judge_signs(signs, suspicions, result.causes, set_aside)
     if found.kind not in (VerdictKind.SOUND, WEAK) or session is None:
         return found
     scores = score_session(session, Inputs.of(recording, prior_map), result.trajectory)
     return judge_signs(with_scores(signs, scores), suspicions, result.causes, set_aside)
+
+
+def _without_doubtful(result: SlamResult) -> tuple[ParameterEstimate, ...]:
+    """Return calibration states but those of a cause that may as well be another: that says more, and what decides."""
+    doubtful = [one for one in result.causes if one.instead and one.probability < SURE]
+    names = {name for one in doubtful for name, _ in OWN_STATES.get(one.code, ())}
+    return tuple(state for state in result.parameters if state.name not in names)
 
 
 def judge_signs(
