@@ -151,6 +151,42 @@ def test_the_evidence_never_falls_from_round_to_round() -> None:
     assert climbed[-1] - climbed[-2] < 1e-3
 
 
+def test_what_is_expected_of_all_is_the_sum_of_what_is_of_each() -> None:
+    time, there = truth(Weibull(60.0, 2.0), Exponential(1.0 / 40.0), 3)
+    there = there[:, : len(time) // 4]
+    looks = looks_at(time[: len(time) // 4], there)
+    model = RunLength(Weibull(50.0, 1.5), Exponential(1.0 / 50.0), STEP_S)
+    whole = Data.of(looks, STEP_S, 500.0, rhythm=False).expect(model)
+    each = []
+    for feature in range(looks.n_features):
+        alone = Data.of(looks.of(feature), STEP_S, 500.0, rhythm=False).expect(model)
+        np.testing.assert_array_equal(whole.presence[feature], alone.presence[0])
+        each.append(alone)
+    assert whole.log_evidence == pytest.approx(sum(one.log_evidence for one in each), rel=1e-12)
+    for state in (0, 1):
+        for name in ("events", "exposure_s", "open_ended"):
+            parts = sum(getattr(one.counts[state], name) for one in each)
+            np.testing.assert_allclose(getattr(whole.counts[state], name), parts, rtol=1e-9, atol=1e-12)
+
+
+def test_lifetimes_that_forget_their_age_need_few_hypotheses() -> None:
+    """And what is learned with few has its ages counted with all."""
+    time, there = truth(Exponential(1.0 / 60.0), Exponential(1.0 / 40.0), 3)
+    looks = looks_at(time[: len(time) // 4], there[:, : len(time) // 4])
+    data = Data.of(looks, STEP_S, np.inf, rhythm=False)
+    few, many = (
+        data.expect(RunLength(Exponential(0.02), Exponential(0.03), STEP_S, hypotheses=number)) for number in (8, 64)
+    )
+    assert few.log_evidence == pytest.approx(many.log_evidence, rel=1e-10)
+    for one, other in zip(few.counts, many.counts, strict=True):
+        assert one.events.sum() == pytest.approx(other.events.sum(), rel=1e-9)
+        assert one.exposure_s.sum() == pytest.approx(other.exposure_s.sum(), rel=1e-9)
+    learned = learn(looks, families=["exponential"])
+    assert learned.model.hypotheses == 64
+    again = data.expect(learned.model)
+    np.testing.assert_allclose(learned.expected.counts[1].events, again.counts[1].events, rtol=1e-9)
+
+
 def test_seen_without_error_rates_are_changes_by_time() -> None:
     time, there = truth(*PAIRS["exponential"], 8)
     learned = learn(looks_at(time, there, 1e-9), families=("exponential",))

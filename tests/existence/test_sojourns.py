@@ -11,7 +11,18 @@ from scipy import stats
 from evermap.existence.learn_sojourns import ranked_fits
 from evermap.existence.lifetimes import edges
 from evermap.existence.rhythm import BINS, HALF_AN_EVENT
-from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns, mean_hazards
+from evermap.existence.sojourns import (
+    BACKGROUND_SPREAD,
+    FAMILIES,
+    SHARE_STRENGTH,
+    WITH_RHYTHM,
+    Sojourns,
+    _gamma_hazard,
+    _lognormal_hazard,
+    _mixture,
+    _weibull_hazard,
+    mean_hazards,
+)
 from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull
 from evermap.types import FloatArray
 
@@ -92,6 +103,48 @@ def test_peaks_are_found_where_they_are(durations: dict[str, FloatArray]) -> Non
         found = FAMILIES["peaks"](counted(durations["peaks"], longest), None).prior
         t = np.array([20.0, 27.0, 30.0, 33.0, 100.0, 180.0])
         np.testing.assert_allclose(found.log_survival(t), TRUE["peaks"].log_survival(t), atol=0.03)
+
+
+@pytest.mark.parametrize("name", ["weibull", "gamma", "lognormal"])
+def test_the_quick_cumulative_hazard_is_that_of_the_family(name: str) -> None:
+    quick = {"weibull": _weibull_hazard, "gamma": _gamma_hazard, "lognormal": _lognormal_hazard}[name]
+    t = np.concatenate([[0.0], np.geomspace(1.0, 3e3, 40)])
+    for a, b in ((np.log(90.0), -0.5), (np.log(90.0), 0.7), (np.log(20.0), 0.0)):
+        family: dict[str, LifetimePrior] = {
+            "weibull": Weibull(np.exp(a), np.exp(b)),
+            "gamma": Gamma(np.exp(a - b), np.exp(b)),
+            "lognormal": LogNormal(a, np.exp(b)),
+        }
+        expected = family[name].cumulative_hazard(t)
+        near = expected < 30.0  # beyond, the gamma's is infinite
+        np.testing.assert_allclose(quick(a, b, t)[near], expected[near], rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("longest", [np.inf, 190.0])
+@pytest.mark.parametrize("n", [0, 2])
+def test_a_mixture_is_where_a_round_of_em_leaves_it(durations: dict[str, FloatArray], n: int, longest: float) -> None:
+    """A round by scipy's truncated normals: who ended belongs where its density is, who went on where its survival."""
+    counts = counted(durations["peaks"], longest)
+    prior = _mixture(counts, n).prior
+    parts = prior.components if isinstance(prior, Mixture) else (prior,)
+    share = np.array(prior.weights if isinstance(prior, Mixture) else [1.0])
+    mean, spread = (np.array([getattr(part, name) for part in parts]) for name in ("mu", "sigma"))
+    x, ended, going = np.log(counts.age_s)[:, None], counts.events, counts.open_ended[:, None]
+    width = np.log(np.diff(counts.edge_s) / counts.age_s + 1.0)[:, None]
+    law = stats.norm(mean, spread)
+    density, beyond = share * law.pdf(x), share * law.sf(x)
+    mine = ended * density / np.maximum(density.sum(axis=1, keepdims=True), 1e-300)
+    open_mine = going * beyond / np.maximum(beyond.sum(axis=1, keepdims=True), 1e-300)
+    some = going[:, 0] > 0.0
+    later = stats.truncnorm((x[some] - mean) / spread, np.inf, mean, spread)
+    weight = (mine + open_mine).sum(axis=0)
+    new_mean = ((mine * x).sum(axis=0) + (open_mine[some] * later.mean()).sum(axis=0)) / weight
+    squares = (mine * ((x - new_mean) ** 2 + width**2 / 12.0)).sum(axis=0)
+    squares += (open_mine[some] * (later.var() + (later.mean() - new_mean) ** 2)).sum(axis=0)
+    typical = np.append(BACKGROUND_SPREAD**2, np.full(n, squares[1:].sum() / weight[1:].sum() if n else 0.0))
+    np.testing.assert_allclose(mean, new_mean, atol=1e-3)  # a component with hardly a stay is slow
+    np.testing.assert_allclose(spread, np.sqrt((squares + typical) / (weight + 1.0)), rtol=1e-3)
+    np.testing.assert_allclose(share, (weight + SHARE_STRENGTH) / (weight + SHARE_STRENGTH).sum(), atol=1e-3)
 
 
 def test_a_smooth_hazard_follows_any(durations: dict[str, FloatArray]) -> None:

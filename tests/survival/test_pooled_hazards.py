@@ -9,6 +9,7 @@ from evermap.maps.lives import general_purpose
 from evermap.survival import (
     Exponential,
     LifetimePrior,
+    LogNormal,
     Mixture,
     PiecewiseConstantHazard,
     Weibull,
@@ -89,6 +90,28 @@ def test_what_lived_to_be_met_says_nothing_of_ages_before() -> None:
     assert upper - lower > 0.6
     later = np.exp(found.prior().log_conditional_survival(2.0 * DAY_S, 4.0 * DAY_S))
     assert later == pytest.approx(np.exp(law.log_conditional_survival(2.0 * DAY_S, 4.0 * DAY_S)), abs=0.08)
+
+
+def test_the_end_of_a_shift_is_within_the_bands() -> None:
+    """All leave after about eight hours and are met earlier, at any age: a process that is not steep enough for that
+    end raises hazards long before it, and is too sure that one in twenty has left by then.
+    """
+    law = LogNormal.from_half_life(8.0 * HOUR_S, 0.1)
+    ages_s = np.asarray(law.quantile(np.array([0.05, 0.1, 0.5, 0.9])))
+    truth, inside, widths = np.exp(law.log_survival(ages_s)), [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        lifetime, entry = law.sample(rng, 2000), rng.uniform(0.0, 8.0 * HOUR_S, 2000)
+        met = np.flatnonzero(lifetime > entry)[:100]
+        gap = 0.8 * HOUR_S * rng.gamma(2.0, 0.5, 100)
+        left = entry[met] + np.floor((lifetime - entry)[met] / gap) * gap
+        found = learned(CensoredLifetimes.of(left, left + gap, entry[met]))
+        _, lower, upper = found.survival(ages_s)
+        inside.append((lower <= truth) & (truth <= upper))
+        widths.append(upper[0] - lower[0])
+    assert np.mean(inside) > 0.85
+    assert np.mean(inside, axis=0)[0] > 0.8
+    assert np.mean(widths) < 0.18
 
 
 def test_a_short_stop_shortens_no_parked_life() -> None:

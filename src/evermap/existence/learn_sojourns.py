@@ -138,7 +138,7 @@ class Data(Shown):
             model: how features come and go, on ordinary days.
             level: (2, P) by what the hazards of absences and stays are multiplied in each week.
         """
-        from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expectations
+        from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expect_all
 
         _, edge = edges(self.step_s)
         group = AGE_GROUP if self.rhythm else 1
@@ -147,15 +147,13 @@ class Data(Shown):
         total = SojournCounts(
             np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros(calendar), np.zeros(calendar)
         )
+        first = np.cumsum([0, *(len(piece.stamp_s) for piece in self.lattices)])
+        looks = LookColumns(*(np.concatenate(column) for column in zip(*self.lattices, strict=True)))
         levels = np.ones(calendar) if level is None else level
-        evidence, presence = 0.0, []
-        for piece, importance, period in zip(self.lattices, self.importance, self.period, strict=True):
-            smoothed = np.empty(len(piece.stamp_s))
-            gain, _ = expectations(
-                piece, Calendar(importance, period, levels), model.slots, model.law, model.first, total, smoothed
-            )
-            evidence += gain
-            presence.append(smoothed)
+        when = Calendar(np.concatenate(self.importance), np.concatenate(self.period), levels)
+        smoothed = np.empty(first[-1])
+        evidence = expect_all(first, looks, when, model.slots, model.law, model.first, total, smoothed)
+        presence = np.split(smoothed, first[1:-1])
         coarse = np.append(edge[::group], 2.0 * edge[-1])
         absences, stays = (Sojourns(coarse, total.events[s], total.exposure_s[s], total.open_ended[s]) for s in (0, 1))
         return Expected((absences, stays), evidence, presence, total.of_period, total.expected_of_period)
@@ -263,6 +261,8 @@ _WARM_UP_ROUNDS = 4
 _TRIAL_ROUNDS = 8
 _LAST_ROUNDS = 3
 _MOST_ROUNDS = 20
+_FEWEST = 8
+"""Hypotheses of a search among lifetimes that forget their age."""
 
 Progress = Callable[[float], None]
 
@@ -419,14 +419,19 @@ def _allowed(families: Sequence[str] | None, *, rhythm: bool) -> tuple[str, ...]
 
 
 def _exponential(data: Data, hypotheses: int, restarts: int, tell: Progress) -> Ascent:
-    """The best exponential lifetimes, from several typical durations on."""
+    """The best exponential lifetimes, from several typical durations on.
+
+    These forget their age, so that few hypotheses are exact but for the ages of the counts, which are counted at last.
+    """
     starts, step = [], data.step_s
     for number, duration in enumerate(np.geomspace(10.0 * step, max(data.span_s / 4.0, 20.0 * step), restarts)):
-        model = RunLength(Exponential(1.0 / duration), Exponential(1.0 / duration), step, hypotheses=hypotheses)
-        starts.append(climb(data, model, ("exponential",), _WARM_UP_ROUNDS))
+        few = RunLength(Exponential(1.0 / duration), Exponential(1.0 / duration), step, hypotheses=_FEWEST)
+        starts.append(climb(data, few, ("exponential",), _WARM_UP_ROUNDS))
         tell(0.3 * (number + 1) / restarts)
     simple = max(starts, key=lambda ascent: ascent.expected.log_evidence)
     found = climb(data, simple.model, ("exponential",), _MOST_ROUNDS)
+    model = replace(found.model, hypotheses=hypotheses)
+    found = replace(found, model=model, expected=data.expect(model, found.level))
     tell(0.5)
     return found
 

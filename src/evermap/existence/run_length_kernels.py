@@ -83,10 +83,12 @@ class Workspace(NamedTuple):
     """Room to work in.
 
     Attributes:
+        hazard: (2, S) filled in: integrated hazards of the last step, without a rhythm.
         scratch: (2, S).
         merged: (2,) filled in: where lists were merged in the last step.
     """
 
+    hazard: FloatArray
     scratch: FloatArray
     merged: IntArray
 
@@ -194,15 +196,15 @@ def _step(
     Hazards are those of the law times `scale`.
     """
     start, weight, count = held
-    scratch, merged = space
+    hazard, scratch, merged = space
     middle = 0.5 * (now + later)
     week = _week_bin(middle, law.factor.shape[2])
     for s in range(2):
-        _hazards(start, count[s], s, now, later, law, scratch)
+        _hazards(start, count[s], s, now, later, law, hazard)
         for k in range(len(weight)):
             factor = scale[s] * law.factor[k, s, week]
             for j in range(count[s]):
-                x, mass = min(factor * scratch[s, j], MOST), weight[k, s, j]
+                x, mass = min(factor * hazard[s, j], MOST), weight[k, s, j]
                 scratch[1 - s, j] = -mass * expm1(-x)
                 weight[k, s, j] = mass * exp(-x) if x < MOST else 0.0
             weight[k, 1 - s, count[1 - s]] = _sum(scratch, 1 - s, count[s])
@@ -320,7 +322,7 @@ def advance(
 @kernel
 def room(slots: int) -> Workspace:
     """Return room to work in."""
-    return Workspace(np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
+    return Workspace(np.zeros((2, slots)), np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
 
 
 @kernel

@@ -20,9 +20,9 @@ from evermap.existence.run_length_kernels import (
     Law,
     RunHypotheses,
     Workspace,
-    _hazards,
     _look,
     _step,
+    _sum,
     _week_bin,
     age_bin,
     begin,
@@ -95,9 +95,9 @@ def _copy(held: RunHypotheses, out: RunHypotheses) -> None:
 @kernel
 def _forward(
     steps: tuple[int, int], looks: LookColumns, calendar: Calendar, law: Law, held: RunHypotheses, space: Workspace,
-    before: RunHypotheses, merges: IntArray, scales: FloatArray,
+    before: RunHypotheses, hazards: FloatArray, merges: IntArray, scales: FloatArray,
 ) -> None:  # fmt: skip
-    """Take some steps, and keep hypotheses `before` each, where it `merges` lists, and the probability of its look."""
+    """Take some steps, and keep hypotheses `before` each, its `hazards` and `merges`, and its look's probability."""
     a, b = steps
     stamp_s, present, absent = looks
     _, period, level = calendar
@@ -105,8 +105,7 @@ def _forward(
         i = k - a
         _copy(held, RunHypotheses(before.start[i], before.weight[i], before.number[i]))
         scale = (level[0, period[k]], level[1, period[k]])
-        _step(held, stamp_s[k], stamp_s[k + 1], law, scale, space)
-        merges[i, 0], merges[i, 1] = space.merged[0], space.merged[1]
+        _step(held, stamp_s[k], stamp_s[k + 1], law, scale, Workspace(hazards[i], space.scratch, merges[i]))
         scales[i] = _look(held, absent[k + 1], present[k + 1])
 
 
@@ -141,7 +140,7 @@ def expectations(
     held, space = nothing_held(slots, law), room(slots)
     start, weight, count = held
     most = min(steps, STRETCH)
-    starts, weights = np.zeros((most, 2, slots)), np.zeros((most, 1, 2, slots))
+    starts, weights, hazards = (np.empty((most, 2, slots)), np.empty((most, 1, 2, slots)), np.empty((most, 2, slots)))
     counts, merges = np.zeros((most, 2), dtype=np.int64), np.zeros((most, 2), dtype=np.int64)
     scales = np.zeros(most)
     before = RunHypotheses(starts, weights, counts)
@@ -153,7 +152,7 @@ def expectations(
     for c in range(stretches):
         _copy(held, RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]))
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
-        _forward((a, b), looks, calendar, law, held, space, before, merges, scales)
+        _forward((a, b), looks, calendar, law, held, space, before, hazards, merges, scales)
         for i in range(b - a):
             evidence += np.log(scales[i])
     if not np.isfinite(evidence):
@@ -170,12 +169,13 @@ def expectations(
 
     # what the looks to come say for each hypothesis, after this step and before it
     later, sooner = np.ones((2, slots)), np.ones((2, slots))
-    usual, lived, died, part = (np.empty((2, slots)), np.empty(slots), np.empty(slots), np.empty(slots))
+    usual, sums, ahead = np.empty((2, slots)), np.empty((4, slots)), np.empty(slots)
+    lived, died, part = np.empty(slots), np.empty(slots), np.empty(slots)
     for c in range(stretches - 1, -1, -1):
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         if c < stretches - 1:  # the last stretch is still there
             _copy(RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]), held)
-            _forward((a, b), looks, calendar, law, held, space, before, merges, scales)
+            _forward((a, b), looks, calendar, law, held, space, before, hazards, merges, scales)
         for k in range(b - 1, a - 1, -1):
             i = k - a
             now, then = stamp_s[k], stamp_s[k + 1]
@@ -191,29 +191,68 @@ def expectations(
                     newcomer -= 1
                 other *= later[1 - s, newcomer]
                 n, drift = counts[i, s], level[s, when]
-                _hazards(starts[i], n, s, now, then, law, usual)
                 for j in range(n):
-                    usual[s, j] *= law.factor[0, s, week]
+                    usual[s, j] = hazards[i, s, j] * law.factor[0, s, week]
                     x = min(drift * usual[s, j], MOST)
                     p_end, p_live = -expm1(-x), exp(-x)
                     died[j], lived[j] = p_end * other, p_live * same
                     # a stay that ends in this step lasted on the mean for this part of it
                     part[j] = 0.5 - x / 12.0 if x < 1e-2 else 1.0 / x - p_live / p_end
-                ended = expected = 0.0
+                merged = merges[i, s]
+                for j in range(n if merged == NO_MERGE else merged + 1):
+                    ahead[j] = later[s, j]
+                for j in range(n if merged == NO_MERGE else merged + 1, n):
+                    ahead[j] = later[s, j - 1]
                 for j in range(n):
-                    to = j - 1 if merges[i, s] != NO_MERGE and j > merges[i, s] else j
-                    mass, lives, ends = weights[i, 0, s, j], lived[j] * later[s, to], died[j]
+                    mass, lives, ends = weights[i, 0, s, j], lived[j] * ahead[j], died[j]
                     sooner[s, j] = lives + ends
-                    if s == 1:
-                        there += mass * (lives + ends)
-                    spent = mass * (lives + part[j] * ends)
-                    ended += mass * ends
-                    expected += usual[s, j] * spent
+                    sums[0, j] = mass * (lives + ends)
+                    sums[1, j] = mass * ends
+                    sums[2, j] = mass * (lives + part[j] * ends)
+                    sums[3, j] = usual[s, j] * sums[2, j]
+                if s == 1:
+                    there = _sum(sums, 0, n)
+                weigh, spend = importance[k], importance[k] * drift * gap
+                for j in range(n):
                     row = group[age_bin(middle - starts[i, s, j], law)]
-                    counts_out.events[s, row, column] += importance[k] * mass * ends
-                    counts_out.exposure_s[s, row, column] += importance[k] * drift * gap * spent
-                counts_out.of_period[s, when] += ended
-                counts_out.expected_of_period[s, when] += expected
+                    counts_out.events[s, row, column] += weigh * sums[1, j]
+                    counts_out.exposure_s[s, row, column] += spend * sums[2, j]
+                counts_out.of_period[s, when] += _sum(sums, 1, n)
+                counts_out.expected_of_period[s, when] += _sum(sums, 3, n)
             smoothed[k] = there
             later, sooner = sooner, later
     return evidence, smoothed[0]
+
+
+@kernel
+def expect_all(
+    first: IntArray,
+    looks: LookColumns,
+    calendar: Calendar,
+    slots: int,
+    law: Law,
+    prior: First,
+    counts_out: SojournCounts,
+    smoothed: FloatArray,
+) -> float:
+    """Add the expected counts of F features by `expectations`, and fill in their presence; returns the log evidence.
+
+    Args:
+        first: (F + 1,) first instant of each feature in `looks`, and their number; F fewer steps than instants.
+        looks: of all features.
+        calendar: of the steps of all features.
+        slots: as of `expectations`, likewise the others.
+        law: the model.
+        prior: its belief before the first look.
+        counts_out: filled up.
+        smoothed: of every instant, filled in.
+    """
+    stamp_s, present, absent = looks
+    importance, period, level = calendar
+    evidence = 0.0
+    for f in range(len(first) - 1):
+        a, b, c, d = first[f], first[f + 1], first[f] - f, first[f + 1] - f - 1
+        own = LookColumns(stamp_s[a:b], present[a:b], absent[a:b])
+        when = Calendar(importance[c:d], period[c:d], level)
+        evidence += expectations(own, when, slots, law, prior, counts_out, smoothed[a:b])[0]
+    return evidence

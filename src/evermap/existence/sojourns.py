@@ -6,13 +6,16 @@ expectation step of EM leaves them. What is found is a lifetime, and a rhythm wh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
 
+from evermap.existence.elementary import kernel
 from evermap.existence.lifetimes import CERTAIN
 from evermap.existence.rhythm import HALF_AN_EVENT, Rhythm, SmoothRates, age_basis, constant, fit, week_basis
 from evermap.show import Shown
@@ -152,7 +155,7 @@ def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
 def _two_parameters(
     family: str,
     build: Callable[[float, float], LifetimePrior],
-    cumulative: Callable[[float, float, FloatArray], FloatArray] | None,
+    cumulative: Callable[[float, float, FloatArray], FloatArray],
     counts: Sojourns,
     _: Fitted | None = None,
 ) -> Fitted:
@@ -161,7 +164,7 @@ def _two_parameters(
     Args:
         family: its name.
         build: makes the lifetime of the two.
-        cumulative: makes its cumulative hazard at some ages, if there is a quicker way than the lifetime's own.
+        cumulative: makes its cumulative hazard at some ages, quicker than the lifetime's own.
         counts: data of the fit.
     """
     from scipy.optimize import minimize
@@ -178,8 +181,7 @@ def _two_parameters(
 
     def loss(parameters: FloatArray) -> float:
         a, b = bounded(parameters)
-        at_edges = cumulative(a, b, edge) if cumulative else build(a, b).cumulative_hazard(edge)
-        hazard = np.maximum(mean_hazards(at_edges, edge), 1e-300)
+        hazard = np.maximum(mean_hazards(cumulative(a, b, edge), edge), 1e-300)
         likelihood = (events * np.log(hazard)).sum() - (exposure * hazard).sum()
         return float(0.01 * parameters[1] ** 2 - likelihood)  # a weak pull to shape 1
 
@@ -200,10 +202,84 @@ def _gamma_hazard(a: float, b: float, edge_s: FloatArray) -> FloatArray:
         return np.asarray(-np.log(gammaincc(exp(b), edge_s / exp(a - b))), dtype=np.float64)
 
 
+def _lognormal_hazard(a: float, b: float, edge_s: FloatArray) -> FloatArray:
+    """Cumulative hazard as of `LogNormal`, at a fifth of the time."""
+    from scipy.special import log_ndtr
+
+    with np.errstate(divide="ignore"):
+        return np.asarray(-log_ndtr((a - np.log(edge_s)) / exp(b)), dtype=np.float64)
+
+
+def _weibull_hazard(a: float, b: float, edge_s: FloatArray) -> FloatArray:
+    """Cumulative hazard as of `Weibull`, at a third of the time."""
+    with np.errstate(over="ignore"):
+        return np.asarray((edge_s / exp(a)) ** exp(b), dtype=np.float64)
+
+
+class Peaks(NamedTuple):
+    """Log-normal components, the wide one first.
+
+    Attributes:
+        mean, spread: (n + 1,) mean and standard deviation of the log duration.
+        share: (n + 1,) of sum 1.
+        typical: (n + 1,) variance that one more event of each would have.
+    """
+
+    mean: FloatArray
+    spread: FloatArray
+    share: FloatArray
+    typical: FloatArray
+
+
+@kernel
+def _climb_mixture(x: FloatArray, width: FloatArray, ended: FloatArray, going: FloatArray, peaks: Peaks) -> None:
+    """Fit `peaks` in place by EM to log durations (B,) in bins of some width, that ended or went on so often."""
+    mean, spread, share, typical = peaks
+    n, root_half = len(mean), math.sqrt(0.5)
+    density, beyond, ratio, second = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    for _ in range(_ROUNDS):
+        weight, total, moment, bent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        # events of each bin and component by their moments about the old mean; these are exact about the new one, too
+        for i in range(len(x)):
+            all_density = all_beyond = 0.0
+            for c in range(n):
+                z = (x[i] - mean[c]) / spread[c]
+                height = math.exp(-0.5 * z * z)
+                density[c] = share[c] * height / spread[c]
+                all_density += density[c]
+                if going[i] == 0.0:
+                    continue
+                survival = 0.5 * math.erfc(z * root_half)
+                beyond[c] = share[c] * survival
+                all_beyond += beyond[c]
+                # moments of a normal variable known to lie beyond x
+                ratio[c] = height / math.sqrt(2.0 * math.pi) / max(survival, 1e-300)
+                second[c] = spread[c] ** 2 * (1.0 + z * ratio[c]) - (spread[c] * ratio[c]) ** 2
+            for c in range(n):
+                mine = ended[i] * density[c] / max(all_density, 1e-300)
+                open_mine = going[i] * beyond[c] / max(all_beyond, 1e-300)
+                at, expected = x[i] - mean[c], spread[c] * ratio[c]
+                weight[c] += mine + open_mine
+                moment[c] += mine * at + open_mine * expected
+                bent[c] += mine * (at * at + width[i] ** 2 / 12.0)
+                bent[c] += open_mine * (max(second[c], 0.0) + expected * expected)
+        for c in range(n):
+            total[c] = max(weight[c], 1e-9)
+        step = np.where(weight > 1e-6, moment / total, 0.0)
+        squares = bent - 2.0 * step * moment + step * step * weight
+        if n > 1:
+            typical[1:] = squares[1:].sum() / max(weight[1:].sum(), 1e-9)
+        new_share = (weight + SHARE_STRENGTH) / (weight + SHARE_STRENGTH).sum()
+        change = np.abs(step).max() + np.abs(new_share - share).max()
+        mean += step
+        spread[:] = np.sqrt((squares + typical) / (weight + 1.0))
+        share[:] = new_share
+        if change < 1e-6:
+            break
+
+
 def _mixture(counts: Sojourns, n: int) -> Fitted:
     """A wide log-normal and `n` narrow ones, by EM on binned durations, those that went on counted by survival."""
-    from scipy.special import ndtr
-
     events = counts.events.sum(1)
     used = np.flatnonzero((events > 1e-6) | (counts.open_ended > 1e-6))
     if counts.n_events < 2.0:
@@ -211,37 +287,12 @@ def _mixture(counts: Sojourns, n: int) -> Fitted:
     x = np.log(counts.age_s[used])
     width = np.log(np.diff(counts.edge_s)[used] / counts.age_s[used] + 1.0)
     ended, going = events[used], counts.open_ended[used]
-    mean, typical = np.empty(n + 1), np.full(n + 1, PEAK_SPREAD**2)
+    typical = np.full(n + 1, PEAK_SPREAD**2)
     typical[0] = BACKGROUND_SPREAD**2
     centre = float((ended * x).sum() / ended.sum())
-    mean[0], mean[1:] = centre, _highest(x, ended, n)
+    mean = np.concatenate([[centre], _highest(x, ended, n)])
     spread, share = np.sqrt(typical), np.full(n + 1, 1.0 / (n + 1))
-    for _ in range(_ROUNDS):
-        z = (x[:, None] - mean) / spread
-        density = share * np.exp(-0.5 * z * z) / spread
-        survival = ndtr(-z)
-        beyond = share * survival
-        mine = ended[:, None] * density / np.maximum(density.sum(1, keepdims=True), 1e-300)
-        open_mine = going[:, None] * beyond / np.maximum(beyond.sum(1, keepdims=True), 1e-300)
-        # moments of a normal variable known to lie beyond x
-        ratio = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / np.maximum(survival, 1e-300)
-        expected = mean + spread * ratio
-        second = spread**2 * (1.0 + z * ratio) - (spread * ratio) ** 2
-        weight = mine.sum(0) + open_mine.sum(0)
-        total = np.maximum(weight, 1e-9)
-        new_mean = (mine.T @ x + (open_mine * expected).sum(0)) / total
-        new_mean = np.where(weight > 1e-6, new_mean, mean)
-        squares = (mine * (x[:, None] - new_mean) ** 2).sum(0)
-        squares += (mine * width[:, None] ** 2 / 12.0).sum(0)
-        squares += (open_mine * (np.maximum(second, 0.0) + (expected - new_mean) ** 2)).sum(0)
-        if n:
-            typical[1:] = squares[1:].sum() / max(weight[1:].sum(), 1e-9)
-        new_spread = np.sqrt((squares + typical) / (weight + 1.0))
-        new_share = (weight + SHARE_STRENGTH) / (weight + SHARE_STRENGTH).sum()
-        change = float(np.abs(new_mean - mean).max() + np.abs(new_share - share).max())
-        mean, spread, share = new_mean, new_spread, new_share
-        if change < 1e-6:
-            break
+    _climb_mixture(x, width, ended, going, Peaks(mean, spread, share, typical))
     parts = [LogNormal(float(m), float(s)) for m, s in zip(mean, spread, strict=True)]
     prior = Mixture.of(parts, [float(s) for s in share]) if n else parts[0]
     return Fitted("peaks", prior, None, 3.0 * n + 2.0)
@@ -261,9 +312,9 @@ Family = Callable[[Sojourns, Fitted | None], Fitted]
 """Counts, and an earlier fit to begin with, to a lifetime."""
 FAMILIES: dict[str, Family] = {
     "exponential": exponential,
-    "weibull": partial(_two_parameters, "weibull", lambda a, b: Weibull(exp(a), exp(b)), None),
+    "weibull": partial(_two_parameters, "weibull", lambda a, b: Weibull(exp(a), exp(b)), _weibull_hazard),
     "gamma": partial(_two_parameters, "gamma", lambda a, b: Gamma(exp(a - b), exp(b)), _gamma_hazard),
-    "lognormal": partial(_two_parameters, "lognormal", lambda a, b: LogNormal(a, exp(b)), None),
+    "lognormal": partial(_two_parameters, "lognormal", lambda a, b: LogNormal(a, exp(b)), _lognormal_hazard),
     "peaks": peaks,
     "smooth": smooth,
 }

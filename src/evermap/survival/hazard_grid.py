@@ -19,8 +19,11 @@ YOUNG = 4.0
 SLOW_SCALE, COMMON = 2.8, (0.3, 0.8)
 """Standard deviation of log hazards (of the rates of the general-purpose prior, an hour to ten years: 3.3), and the
 share of their variance that classes have in common."""
-FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.25, 2.0, 0.02))
-"""Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule."""
+FAST = ((0.8, 0.1, 0.85), (0.8, 0.5, 0.1), (0.8, 1.5, 0.03), (0.8, 4.0, 0.02))
+"""Lengths and standard deviations of the fast process, and their probabilities: hazards are smooth, as a rule. The
+steepest is beyond what the end of a shift has most evidence for: where the edge of a grid is more probable than all
+within, bands are too narrow, and too sure that some leave long before that end. Such ends come hours after an arrival:
+below an hour the standard deviations fall in proportion to age."""
 DRAWS, LEAST_DRAWS, NEGLIGIBLE = 256, 32, 5e-3
 """Draws for the most probable member of the grid, half of them mirror images of the other half, and for others in
 proportion to their probability, but so many; and the probability below which there are none."""
@@ -50,9 +53,11 @@ def make_scales(edges: tuple[float, ...]) -> tuple[HazardScale, ...]:
     ends_s = np.append(edges_s[1:], 2.0 * edges_s[-1])
     age = np.log(np.sqrt(np.maximum(edges_s, 0.25 * ends_s) * ends_s) / HOUR_S)
     where = np.where(age < 0.0, YOUNG * age, age)
+    share = np.minimum(np.exp(age), 1.0)
     found = []
     for length, fast, p in FAST:
-        values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + fast**2 * _matern(age, length))
+        of_fast = fast**2 * np.outer(share, share) * _matern(age, length)
+        values, vectors = np.linalg.eigh(SLOW_SCALE**2 * _matern(where, SLOW) + of_fast)
         kept = values > NEGLECTED * values[-1]
         columns = vectors[:, kept] * np.sqrt(values[kept])
         found += [HazardScale(columns, common, p / len(COMMON)) for common in COMMON]

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.yard import error_m, is_true
+from benchmarks.yard import error_m, is_true, with_noise
 
 import evermap as em
 from evermap.config import Config
+from evermap.geometry import se3
+from evermap.geometry.symmetry import Symmetries
 from evermap.maps.sessions.extend import fellows_of
-from evermap.slam.space.bodies import with_rests
+from evermap.slam.space.bodies import _is_elsewhere, with_rests
 from evermap.slam.space.intake import SpatialIntake, prepare_space
-from evermap.types import UNKNOWN, ChangeKind, MapChange, SlamResult, rows_of
+from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, MapChange, SlamResult, rows_of
 from evermap_studies.worlds.yard import YardConfig, YardDrive, simulate_yard
 
 DRIVING = YardConfig(moving=6, parked=0)
@@ -59,6 +63,50 @@ def test_members_neither_move_nor_part_alone(run: tuple[YardDrive, SlamResult]) 
     assert (result.landmarks.landmark_id < len(drive.tag)).all()  # no second identity
     parted = {(change.stamp_from_s, tuple(drive.body_of_tag[list(change.landmark_ids)])) for change in result.changes}
     assert len(parted) == len(result.changes)
+
+
+def at_rests(turn_rad: float, off_m: float, sigma: tuple[float, float], *, oriented: bool = True) -> tuple[Any, Any]:
+    """An optimum of one landmark at two rests, in rows 0 and 1 after three poses, and the spread of its variables."""
+    place = se3.retract(se3.identity(2), np.array([np.zeros(6), [off_m, 0.0, 0.0, 0.0, 0.0, turn_rad]]))
+    problem = SimpleNamespace(stamp_s=np.arange(3.0), oriented=np.full(2, oriented), symmetries=Symmetries.none(2))
+    variance = np.repeat(np.square(sigma), 3)
+
+    def of(variable: IntArray, dim: int) -> FloatArray:
+        assert (variable >= 3).all()
+        return np.tile(np.diag(variance[:dim]), (len(variable), 1, 1))
+
+    smoother, estimate = SimpleNamespace(problem=problem), SimpleNamespace(place=place)
+    return SimpleNamespace(smoother=smoother, estimate=estimate), SimpleNamespace(of=of)
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "off_m", "sigma", "oriented", "elsewhere"),
+    [
+        (0.0, 0.5, (0.12, 0.02), True, False),  # half a metre off, by poses that have drifted
+        (0.5, 0.5, (0.12, 0.02), True, True),  # the same, and turned: it drove
+        (0.5, 0.0, (0.12, 0.12), True, False),  # turned by less than is known
+        (0.2, 0.0, (0.001, 0.001), True, False),  # errors of an orientation beside its noise
+        (0.0, 0.5, (0.02, 0.0), True, True),
+        (0.0, 0.15, (0.001, 0.001), True, False),
+        (3.0, 0.0, (0.02, 0.02), False, False),  # a point has no orientation
+        (0.0, 0.5, (0.02, 0.02), False, True),
+    ],
+)
+def test_two_rests_are_told_apart_by_place_and_by_orientation(
+    turn_rad: float, off_m: float, sigma: tuple[float, float], oriented: bool, elsewhere: bool
+) -> None:
+    optimum, spread = at_rests(turn_rad, off_m, sigma, oriented=oriented)
+    assert _is_elsewhere(optimum, spread, np.array([0]), np.array([1])) is elsewhere
+
+
+@pytest.mark.slow
+def test_a_body_that_turned_between_two_looks_has_two_rests() -> None:
+    """A tag that was seen before and after its forklift drove by less than the poses had drifted, but turned."""
+    moving, standing = (simulate_yard(replace(DRIVING, standing=still), seed=1)[0] for still in (False, True))
+    drive = with_noise(moving, standing, DRIVING, 1)
+    changes = em.run_slam(drive.recording).changes
+    assert len(changes) > 4
+    assert all(is_true(change, drive) for change in changes)
 
 
 def test_a_yard_that_stands_is_mapped_as_if_nothing_was_stated() -> None:

@@ -28,8 +28,8 @@ STILL_M = 0.02
 NEAR_S = 0.5
 """Time from a frame with a landmark on no body in which the odometry is believed."""
 ROUNDS = 2
-ELSEWHERE, SLACK_M = 4.0, 0.05
-"""Standard deviations by which two places of a rest differ at least, with this error more."""
+ELSEWHERE, SLACK_M, SLACK_RAD = 4.0, 0.05, 0.05
+"""Standard deviations by which two places of a rest differ at least, with these errors more."""
 
 FEWEST = 3
 """Landmarks on no body that tell where a session is in a map, at least."""
@@ -295,14 +295,21 @@ def _find_shared(one: IntArray, other: IntArray, landmark: IntArray) -> tuple[In
 
 
 def _is_elsewhere(optimum: SpatialOptimum, spread: Spread, a: IntArray, b: IntArray) -> bool:
-    """Tell whether landmarks of a body are at other places in one rest (a) than in another one (b)."""
-    problem, places, variance = optimum.smoother.problem, np.append(a, b), np.empty(2 * len(a))
+    """Tell whether landmarks of a body are elsewhere, or turned, in one rest (a) and in another one (b).
+
+    A body that drives turns: where poses have drifted by half a metre between two rests, an orientation still tells.
+    """
+    problem, place, places = optimum.smoother.problem, optimum.estimate.place, np.append(a, b)
+    variance = np.full((2 * len(a), 2), np.inf)
     for dim, some in ((3, ~problem.oriented[places]), (6, problem.oriented[places])):
         own = spread.of(len(problem.stamp_s) + places[some], dim)
-        variance[some] = np.trace(own[:, :3, :3], axis1=1, axis2=2) / 3.0
-    off = np.linalg.norm(optimum.estimate.place[b, :3] - optimum.estimate.place[a, :3], axis=1)
-    sigma_m = np.sqrt(variance[: len(a)] + variance[len(a) :] + SLACK_M**2)
-    return bool(np.median(off / sigma_m) > ELSEWHERE)
+        for part in range(dim // 3):
+            rows = slice(3 * part, 3 * part + 3)
+            variance[some, part] = np.trace(own[:, rows, rows], axis1=1, axis2=2) / 3.0
+    off = np.linalg.norm(place[b, :3] - place[a, :3], axis=1)
+    turn = np.where(problem.oriented[a], problem.symmetries[a].angle_between(place[a], place[b]), 0.0)
+    sigma = np.sqrt(variance[: len(a)] + variance[len(a) :] + np.square([SLACK_M, SLACK_RAD]))
+    return bool(np.median((np.column_stack([off, turn]) / sigma).max(axis=1)) > ELSEWHERE)
 
 
 def _moves_of(groups: list[IntArray], rests: Rests) -> list[BodyMove]:
