@@ -18,6 +18,9 @@ from evermap.slam.check import find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
 from evermap.slam.orientations import find_convention
 from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
+from evermap_studies.causes.catalogue import catalogue
+from evermap_studies.causes.drives import as_recording
+from evermap_studies.causes.judge import make_case
 
 from .worlds import World
 
@@ -483,3 +486,54 @@ def test_two_mistakes_of_a_drive_are_undone_one_after_the_other(first: Mistake, 
     np.testing.assert_allclose(at_once[:, :3], one_by_one[:, :3], atol=1e-9)
     turns = [Rotation.from_quat(each[:, 3:]).as_matrix() for each in (at_once, one_by_one)]
     np.testing.assert_allclose(*turns, atol=1e-9)
+
+
+def mirrored(given: Landmarks) -> Landmarks:
+    """With y to the right."""
+    return replace(given, position_m=given.position_m * [1.0, -1.0])
+
+
+def clockwise(recording: Recording) -> Recording:
+    """Bearings and turns, where y is to the right."""
+    seen, driven = recording.detections, recording.odometry
+    driven = replace(driven, angular_radps=-driven.angular_radps, lateral_mps=-driven.lateral_mps)
+    return replace(recording, detections=replace(seen, bearing_rad=-seen.bearing_rad), odometry=driven)
+
+
+def test_of_a_mirrored_map_and_clockwise_readings_one_is_wrong_and_nothing_says_which() -> None:
+    recording = World(seed=4, seconds=20.0).plane()
+    given = Landmarks.at(np.arange(16), World().place[:, :2], sigma_m=0.01, frame="prior_map")
+    for one, other in ((recording, mirrored(given)), (clockwise(recording), given)):
+        result = run_slam(one, prior_map=other)  # the sensor sits on the axis of the robot
+        (cause,) = result.causes
+        assert cause.code in ("map-mirrored", "bearing-sign")
+        assert cause.probability == pytest.approx(0.5, abs=0.05)
+        assert result.verdict is not None
+        assert not result.verdict.kind.is_trustworthy
+        assert "clockwise, both" in result.verdict.message
+        assert "the given map is mirrored" in result.verdict.message
+        assert result.changes == ()
+
+
+@pytest.mark.parametrize(("wrong", "code"), [("sign of turning", "turn-sign"), ("map mirrored", "map-mirrored")])
+def test_of_ranges_alone_the_side_of_the_sensor_tells_turns_from_a_mirrored_map(wrong: str, code: str) -> None:
+    world = next(one for one in catalogue() if one.name == f"uwb in a map: {wrong}")
+    given = make_case(replace(world, make=replace(world.make, duration_s=90.0)), 1).given
+    assert given.sensors[0].mount_robot_sensor[1] == 0.05
+    result = run_slam(as_recording(given), prior_map=given.places)
+    (cause,) = result.causes
+    assert (cause.code, cause.probability > 0.9) == (code, True)
+    assert result.verdict is not None
+    assert not result.verdict.kind.is_trustworthy
+
+
+def test_a_radio_beside_the_axis_shows_the_sign_of_turns_without_a_map() -> None:
+    world = next(one for one in catalogue() if one.name == "uwb alone: nothing wrong")
+    recording = as_recording(make_case(replace(world, make=replace(world.make, duration_s=90.0)), 1).given)
+    assert isinstance(recording, Recording)
+    turned = replace(recording.odometry, angular_radps=-recording.odometry.angular_radps)
+    right, wrong = run_slam(recording).verdict, run_slam(replace(recording, odometry=turned)).verdict
+    assert right is not None
+    assert wrong is not None
+    assert (right.kind, wrong.kind) == (VerdictKind.SOUND, VerdictKind.WEAK)
+    assert "mirrored" in [one.code for one in wrong.symptoms if one.is_alarming]

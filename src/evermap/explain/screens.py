@@ -91,6 +91,8 @@ def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspe
         placed = max(placed, now.placed)
         if now.placed >= PLACED and now.share > as_given.share + BETTER:
             found.append((now.share + suspect.p, suspect, 0.0))
+    mirrored = [gain for gain, one, _ in found if one.code == "map-mirrored"]
+    found += [(mirrored[0], one, 0.0) for one in suspects if mirrored and one.mirrors and not one.shows]
     found.sort(key=lambda each: -each[0])
     for _, suspect, state in seeds:
         if suspect.of_map and (undone := suspect.undo(inputs, state).prior_map) is not None:
