@@ -17,6 +17,7 @@ from evermap.explain.scores import SessionScores
 from evermap.geometry import se2, se3
 from evermap.slam.association.features import medians
 from evermap.slam.gaps import find_gaps, is_outside
+from evermap.slam.ranges import compare_with_mirrored
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -215,8 +216,7 @@ class Signs:
             the poses, of those that are significant (`explain.scores`), and its words; 0 where none is.
         alternation: standard deviations by which errors of the odometry alternate from step to step.
         adrift: poses beside a break of the odometry, whose detections are not used.
-        hand: nats by which where the sensor sits speaks for the drive, and not for its mirror image; nan where bearings
-            or a map show the sign of turns.
+        hand: nats for the sign of turns, by where the sensor sits; nan where bearings or a map show it.
         dropped, bent_nats, lead_nats: of detections without identities (`AssociationEvidence`): share of no landmark,
             nats for each landmark met again, and log evidence over odometry alone.
     """
@@ -312,13 +312,14 @@ def measure_signs(
     inlier = result.innovations.p_inlier >= USED
     nis, found = comparable_nis(result.innovations), result.association
     fine = inlier & np.isfinite(nis)
+    lag = lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))
     is_in_map = prior_map is not None and result.landmarks.frame == "prior_map"
     seen, driven = _noise_over_start(result.parameters)
     return Signs(
         n_landmarks=len(result.landmarks),
         n_used=int(inlier.sum()),
         nis=float(nis[fine].mean()) if fine.any() else nan,
-        nis_lag=_or_nan(lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))),
+        nis_lag=nan if lag is None else float(lag),
         used=used,
         used_worst=worst,
         named=named,
@@ -350,7 +351,7 @@ def measure_signs(
         in_map=None if prior_map is None else is_in_map,
         alternatives=len(result.alternatives),
         n_unknown=_count_unknown(result),
-        hand=nan if is_in_map else _compare_with_mirrored(result, recording),
+        hand=nan if is_in_map else compare_with_mirrored(result, recording),
         dropped=nan if found is None else found.dropped,
         bent_nats=nan if found is None else found.nats_per_closure,
         lead_nats=nan if found is None else found.lead_nats,
@@ -360,10 +361,6 @@ def measure_signs(
 def _count_unknown(result: SlamResult) -> int:
     tables = result.trajectory.pose_world_robot, result.landmarks.position_m
     return sum(int(np.count_nonzero(~np.isfinite(table).all(axis=1))) for table in tables)
-
-
-def _or_nan(value: float | None) -> float:
-    return nan if value is None else float(value)
 
 
 def _median(values: FloatArray) -> float:
@@ -560,26 +557,6 @@ def _shift_by_clock_m(result: SlamResult) -> float:
     dim = 2 if path.pose_world_robot.shape[1] == 3 else 3
     went = np.linalg.norm(np.diff(path.pose_world_robot[:, :dim], axis=0), axis=1)
     return abs(delay.value) * float(went.sum()) / max(float(path.stamp_s[-1] - path.stamp_s[0]), 1e-9)
-
-
-def _compare_with_mirrored(result: SlamResult, recording: AnyRecording) -> float:
-    """Return by how much where the sensor sits speaks for the drive, not its mirror image [nats]; nan of bearings.
-
-    If y and the sign of turns are reversed, all ranges stay what they are, but that the sensor is on the other side.
-    """
-    if is_in_space(recording):
-        return nan
-    seen = recording.detections
-    with_bearing = np.isfinite(seen.bearing_rad) & ~(seen.sigma_bearing_rad >= ANY_BEARING_RAD)
-    used = result.innovations.detection[result.innovations.p_inlier >= USED]
-    if np.count_nonzero(with_bearing[used[used < len(seen)]]) >= FEWEST:
-        return nan
-    left = next((one for one in result.parameters if one.name == "mount_left_m" and one.prior_sigma > 0.0), None)
-    if left is None:
-        return nan
-    stated_m = float(recording.sensor.mount_robot_sensor[1])
-    mirrored_m = -2.0 * stated_m - left.value
-    return 0.5 * ((mirrored_m - left.prior_mean) ** 2 - (left.value - left.prior_mean) ** 2) / left.prior_sigma**2
 
 
 def _is_length_stated(recording: AnyRecording) -> bool:

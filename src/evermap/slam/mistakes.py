@@ -199,27 +199,8 @@ RANGED = (
         lateral=-1.0,
         field="forward_mps",
     ),
-    Mistake(
-        "turn-sign",
-        "turn rates seem to have the wrong sign: counter-clockwise is positive, from x ahead to y on the left "
-        "(angular_radps)",
-        bearing=-1.0,
-        lateral=-1.0,
-        turn=-1.0,
-        field="angular_radps",
-    ),
 )
 """Mistakes of robots whose sensor measures ranges alone: the first bearings, which are guessed, follow the odometry."""
-CLOCKWISE = Mistake(
-    "bearing-sign",
-    "bearings and turn rates seem to be clockwise, both: counter-clockwise is positive, from x ahead to y on the left "
-    "(bearing_rad, angular_radps)",
-    bearing=-1.0,
-    turn=-1.0,
-    lateral=-1.0,
-    field="bearing_rad, angular_radps",
-)
-"""What mirrors all that is measured: no pair of sightings shows it."""
 AXES = tuple(
     Mistake(
         "mount-axes",

@@ -450,7 +450,7 @@ def _causes() -> list[World]:
         seeds=5,
         values=(1.06, 1 / 1.06, 0.06),
     )
-    some.add("laser corners", "half of the map mirrored", "map site", wrong.map_mirrored(half=True), maps=MAP, seeds=5)
+    some.add("laser corners", "half of the map mirrored", "map part", wrong.map_mirrored(half=True), maps=MAP, seeds=5)
     return some.worlds
 
 
