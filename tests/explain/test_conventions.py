@@ -12,12 +12,16 @@ from scipy.spatial.transform import Rotation
 from evermap import check_recording, run_slam
 from evermap.errors import DataError
 from evermap.explain.seeds import find_mount
-from evermap.explain.shape import compare_shapes
+from evermap.explain.shape import compare_shapes, find_mirrored_part
 from evermap.io.spatial import with_tag_poses
+from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.check import find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
 from evermap.slam.orientations import find_convention
 from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
+from evermap_studies.causes.catalogue import catalogue
+from evermap_studies.causes.drives import as_recording
+from evermap_studies.causes.judge import make_case
 
 from .worlds import World
 
@@ -483,3 +487,118 @@ def test_two_mistakes_of_a_drive_are_undone_one_after_the_other(first: Mistake, 
     np.testing.assert_allclose(at_once[:, :3], one_by_one[:, :3], atol=1e-9)
     turns = [Rotation.from_quat(each[:, 3:]).as_matrix() for each in (at_once, one_by_one)]
     np.testing.assert_allclose(*turns, atol=1e-9)
+
+
+def in_survey(position_m: FloatArray) -> Landmarks:
+    """The map of World with other places."""
+    return Landmarks.at(np.arange(len(position_m)), position_m, sigma_m=0.01, frame="prior_map")
+
+
+def clockwise(recording: Recording) -> Recording:
+    """Bearings and turns, where y is to the right."""
+    seen, driven = recording.detections, recording.odometry
+    driven = replace(driven, angular_radps=-driven.angular_radps, lateral_mps=-driven.lateral_mps)
+    return replace(recording, detections=replace(seen, bearing_rad=-seen.bearing_rad), odometry=driven)
+
+
+def test_of_a_mirrored_map_and_clockwise_readings_one_is_wrong_and_nothing_says_which() -> None:
+    recording = World(seed=4, seconds=20.0).plane()
+    place = World().place[:, :2]
+    for one, other in (
+        (recording, in_survey(place * [1.0, -1.0])),
+        (clockwise(recording), in_survey(place)),
+    ):
+        result = run_slam(one, prior_map=other)  # the sensor sits on the axis of the robot
+        (cause,) = result.causes
+        assert cause.code in ("map-mirrored", "bearing-sign")
+        assert cause.probability == pytest.approx(0.5, abs=0.05)
+        assert result.verdict is not None
+        assert not result.verdict.kind.is_trustworthy
+        assert "clockwise, both" in result.verdict.message
+        assert "the given map is mirrored" in result.verdict.message
+        assert result.changes == ()
+
+
+@pytest.mark.parametrize("wrong", ["forward speeds", "units"])
+def test_a_mirrored_map_is_found_beside_another_mistake(wrong: str) -> None:
+    """Whose shape of the session is wrong, too; and which of all readings and the map is mirrored stays open."""
+    recording = World(seed=4, seconds=20.0).plane()
+    driven, given = recording.odometry, in_survey(World().place[:, :2] * [1.0, -1.0])
+    factor = -1.0 if wrong == "forward speeds" else 3.6
+    driven = replace(driven, forward_mps=factor * driven.forward_mps)
+    result = run_slam(replace(recording, odometry=driven), prior_map=given)
+    first, second = result.causes
+    assert first.code == ("forward-sign" if wrong == "forward speeds" else "length-unit")
+    assert (first.probability > 0.99, second.code in ("map-mirrored", "bearing-sign")) == (True, True)
+    assert second.probability == pytest.approx(0.5, abs=0.05)
+    assert result.changes == ()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_a_part_of_a_map_that_is_mirrored_is_one_cause_and_no_moves(share: float) -> None:
+    recording, place = World(seed=4, seconds=20.0).plane(), World().place[:, :2].copy()
+    part = place[:, 0] > np.quantile(place[:, 0], 1.0 - share)
+    place[part, 1] = 9.0 - place[part, 1]
+    result = run_slam(recording, prior_map=in_survey(place))
+    (cause,) = result.causes
+    assert (cause.code, cause.subject, cause.probability > 0.99) == ("map-mirrored", "map: a part", True)
+    moved = np.flatnonzero(part & (np.abs(2.0 * place[:, 1] - 9.0) > 0.1))
+    assert cause.message.endswith(": landmarks " + ", ".join(map(str, moved)))
+    assert result.changes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.MAP_OUTDATED
+    assert recording.truth is not None
+    found = evaluate_trajectory(result.trajectory, recording.truth, align=False)
+    assert found is not None
+    assert found.rmse_m < 0.02
+
+
+def test_a_mirrored_part_is_where_it_is_in_the_frame_of_the_map() -> None:
+    true, random = World().place, np.random.default_rng(3)
+    for dim in (2, 3):
+        at = true[:, :dim] + random.normal(0.0, 0.002, (16, dim))
+        part = at[:, 0] > 6.5
+        turned = Rotation.from_euler("z", 1.1).as_matrix()[:dim, :dim]
+        found = Landmarks.at(np.arange(16), at @ turned.T + 2.0) if dim == 2 else Landmarks.in_space(
+            np.arange(16), at @ turned.T + 2.0
+        )  # fmt: skip
+        given = at.copy()
+        given[part, 1] = 9.0 - given[part, 1]
+        mapped = replace(found, position_m=given)
+        found_part = find_mirrored_part(found, mapped)
+        assert found_part is not None
+        names, position_m = found_part
+        np.testing.assert_array_equal(names, np.flatnonzero(part))
+        np.testing.assert_allclose(position_m, at[part], atol=1e-6)
+        assert find_mirrored_part(found, replace(found, position_m=at)) is None
+        given[part] = at[part] + [3.0, 1.0, 0.0][:dim]  # moved together
+        assert find_mirrored_part(found, replace(found, position_m=given)) is None
+        given[part] = random.permutation(at[part]) + random.normal(0.0, 1.0, at[part].shape)  # each by itself
+        assert find_mirrored_part(found, replace(found, position_m=given)) is None
+        given = at.copy()
+        given[:3, 1] = 9.0 - given[:3, 1]  # three always fit a mirror
+        assert find_mirrored_part(found, replace(found, position_m=given)) is None
+
+
+@pytest.mark.parametrize(("wrong", "code"), [("sign of turning", "turn-sign"), ("map mirrored", "map-mirrored")])
+def test_of_ranges_alone_the_side_of_the_sensor_tells_turns_from_a_mirrored_map(wrong: str, code: str) -> None:
+    world = next(one for one in catalogue() if one.name == f"uwb in a map: {wrong}")
+    given = make_case(replace(world, make=replace(world.make, duration_s=90.0)), 1).given
+    assert given.sensors[0].mount_robot_sensor[1] == 0.05
+    result = run_slam(as_recording(given), prior_map=given.places)
+    (cause,) = result.causes
+    assert (cause.code, cause.probability > 0.9) == (code, True)
+    assert result.verdict is not None
+    assert not result.verdict.kind.is_trustworthy
+
+
+def test_a_radio_beside_the_axis_shows_the_sign_of_turns_without_a_map() -> None:
+    world = next(one for one in catalogue() if one.name == "uwb alone: nothing wrong")
+    recording = as_recording(make_case(replace(world, make=replace(world.make, duration_s=90.0)), 1).given)
+    assert isinstance(recording, Recording)
+    turned = replace(recording.odometry, angular_radps=-recording.odometry.angular_radps)
+    right, wrong = run_slam(recording).verdict, run_slam(replace(recording, odometry=turned)).verdict
+    assert right is not None
+    assert wrong is not None
+    assert (right.kind, wrong.kind) == (VerdictKind.SOUND, VerdictKind.WEAK)
+    assert "mirrored" in [one.code for one in wrong.symptoms if one.is_alarming]

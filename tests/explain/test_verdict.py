@@ -69,7 +69,7 @@ def test_a_cause_is_told_with_its_remedy_where_it_is_sure() -> None:
 
 
 def test_a_cause_that_another_may_hold_instead_of_is_weak_and_names_both() -> None:
-    size = Cause("tag-size", "all tags", "tags are 10 % larger", probability=0.7, instead="the wheels are smaller")
+    size = Cause("tag-size", "all tags", "tags are 10 % larger", 1.1, 0.01, 0.7, instead="the wheels are smaller")
     found = judge_signs(GOOD, causes=[size])
     assert found.kind is VerdictKind.WEAK
     assert "tags are 10 % larger (70%), or the wheels are smaller" in found.message
@@ -98,6 +98,39 @@ def test_a_scale_that_another_cause_may_be_is_no_suspicion() -> None:
     assert kind_of(replace(cause, probability=SURE)) is VerdictKind.SENSOR_SUSPECT
     assert kind_of(replace(cause, instead="")) is VerdictKind.SENSOR_SUSPECT
     assert kind_of(replace(cause, code="clock")) is VerdictKind.SENSOR_SUSPECT
+
+
+def test_one_of_two_mistakes_makes_a_run_unusable_whichever_it_is() -> None:
+    mistake = Cause("turn-sign", "angular_radps", "turns have the wrong sign", probability=0.5, instead="map mirrored")
+    for cause, kind in (
+        (mistake, VerdictKind.SENSOR_SUSPECT),
+        (replace(mistake, code="map-mirrored", subject="map"), VerdictKind.MAP_OUTDATED),
+        (replace(mistake, instead=""), VerdictKind.WEAK),  # or nothing is off
+        (replace(mistake, value=1.1, sigma=0.01), VerdictKind.WEAK),
+    ):
+        found = judge_signs(GOOD, causes=[cause])
+        assert found.kind is kind
+        assert "of two explanations nothing says which holds" in found.message
+
+
+def test_of_ranges_alone_the_side_of_the_sensor_shows_the_sign_of_turns() -> None:
+    recording, survey = recorded()
+    result = run_slam(recording)
+    assert np.isnan(measure_signs(result, recording).hand)  # bearings show it
+    seen = replace(recording.detections, bearing_rad=np.full(len(recording.detections), np.nan))
+    for stated_m, off_m, expected in ((0.05, 0.0, 5.556), (0.05, -0.1, -5.556), (-0.05, 0.02, 3.333), (0.0, 0.02, 0.0)):
+        sensor = replace(recording.sensor, mount_robot_sensor=(0.3, stated_m, 0.0))
+        parameters = tuple(
+            replace(one, value=off_m, prior_sigma=0.03) if one.name == "mount_left_m" else one
+            for one in result.parameters
+        )
+        sided, radio = replace(result, parameters=parameters), replace(recording, detections=seen, sensor=sensor)
+        assert measure_signs(sided, radio).hand == pytest.approx(expected, abs=0.001)
+        assert ("mirrored" in alarms(sided, radio)) is (expected < 3.0)
+        placed = replace(sided, landmarks=replace(sided.landmarks, frame="prior_map"))
+        assert np.isnan(measure_signs(placed, radio, survey).hand)
+        free = tuple(replace(one, prior_sigma=0.0) if one.name == "mount_left_m" else one for one in parameters)
+        assert np.isnan(measure_signs(replace(sided, parameters=free), radio).hand)
 
 
 def test_a_delay_that_the_estimator_put_right_is_no_suspicion() -> None:

@@ -24,7 +24,7 @@ from evermap.geometry.square import with_square_poses
 from evermap.geometry.symmetry import Symmetry
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
-from evermap.slam.orientations import find_convention
+from evermap.slam.orientations import MIRRORED, MIRRORED_TURNS, find_convention
 from evermap.slam.space.intake import without_range
 from evermap.types import (
     ANY_BEARING_RAD,
@@ -224,10 +224,10 @@ def _in_plane(recording: Recording, *, calibrations: bool) -> Iterable[Suspect]:
             mistake.code, mistake.field, UNIT_P if mistake.code == "length-unit" else USUAL_P,
             partial(_undo_in_plane, mistake=mistake), _constant(mistake.message), _constant(_fix_of(mistake)),
         )  # fmt: skip
-    for mistake in () if bearings else mistakes.RANGED:
+    for mistake in (MIRRORED,) if bearings else (*mistakes.RANGED, MIRRORED_TURNS):
         yield Suspect(
             mistake.code, mistake.field, USUAL_P, partial(_undo_in_plane, mistake=mistake), _constant(mistake.message),
-            _constant(_fix_of(mistake)), pairs=False, shows=True,
+            _constant(_fix_of(mistake)), pairs=False, shows=not bearings,
         )  # fmt: skip
     for identity in () if calibrations else _seen_often(recording):
         yield _one_size(names.get(identity, str(identity)), _stretch_ranges, ("id", identity), "")

@@ -46,7 +46,7 @@ from evermap.explain.trial import (
     weigh_solution,
     with_information,
 )
-from evermap.explain.triggers import CHANGES, SINGLE, find_symptoms
+from evermap.explain.triggers import CHANGES, SINGLE, contradicts_odometry, find_symptoms
 from evermap.types import Cause, SlamResult, is_in_space
 
 REFINED = 2
@@ -103,14 +103,16 @@ def explain(
     base = None if solution is None else weigh_solution(inputs, solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = Budget(rules.most_solutions)
-    alone = _solve_alone(base, inputs, solve_under, rules.rejected, budget)
-    screens = (partial(screen_plain, alone=alone), *screens[1:])
     weighed = [] if base is None else [base]
     best = base
     for _ in range(rules.most_causes):
-        found = _next_cause(best, inputs, solve_under, config, budget, weighed, screens)
+        given = inputs if best is None else best.inputs  # what is wrong with the drive bends its shape
+        alone = _solve_alone(best, given, solve_under, rules.rejected, budget)
+        shown = (partial(screen_plain, alone=alone), *screens[1:])
+        found = _next_cause(best, inputs, solve_under, config, budget, weighed, shown)
         if found is None:
             break
+        found = _ask_rivals(found, solve_under, rules.lead_nats, budget, weighed)
         best = _without_needless(found, inputs, solve_under, budget, weighed)
         if not find_symptoms(best.solution.result, best.inputs, config):
             break
@@ -226,7 +228,8 @@ def _is_metre_known(inputs: Inputs) -> bool:
 
 def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> bool:
     """Return whether a trial has fewer symptoms, fewer landmarks that are told to have changed, or rejects far less; or
-    leaves far less for scores to say, where these were all that was asked.
+    agrees with its odometry, which the other contradicts; or leaves far less for scores to say, where these were all
+    that was asked.
     """
     was, now = best.solution.result, trial.solution.result
     before, after = find_symptoms(was, best.inputs, config), find_symptoms(now, trial.inputs, config)
@@ -235,6 +238,8 @@ def _relieves(trial: Trial[VisitT], best: Trial[VisitT], config: SlamConfig) -> 
     changed = [count_changed(result) for result in (was, now)]
     rejected = [share_rejected(result) for result in (was, now)]
     if len(after) < len(before) or changed[1] < changed[0] or rejected[1] < FEWER * rejected[0]:
+        return True
+    if contradicts_odometry(was, best.inputs) and not contradicts_odometry(now, trial.inputs):
         return True
     if not {*before, *after} <= {CHANGES}:
         return False
@@ -262,6 +267,25 @@ def _solve_alone(
         return solve_under(replace(inputs, prior_map=None)).result
     except EvermapError:
         return None
+
+
+def _ask_rivals(
+    best: Trial[VisitT], solve_under: Solve[VisitT], lead_nats: float, budget: Budget, weighed: list[Trial[VisitT]]
+) -> Trial[VisitT]:
+    """Return the best of a trial and of those with its last cause beside others that explained as much before it."""
+    *others, last = best.taken
+    before = next((trial for trial in weighed if trial.taken == tuple(others)), None)
+    if before is None or not others:
+        return best
+    for rival in [one for one in weighed if len(one.taken) == len(others) and one.taken != before.taken]:
+        known = {(one.suspect.code, one.suspect.subject) for one in rival.taken}
+        if (last.suspect.code, last.suspect.subject) in known or not abs(rival.beats(before)) < lead_nats:
+            continue
+        trial = solve_trial(rival.inputs, rival.taken, last.suspect, last.state, solve_under, budget)
+        if trial is not None:
+            weighed.append(trial)
+            best = trial if trial.beats(best) > 0.0 else best
+    return best
 
 
 def _without_needless(

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import CLOCK
-from evermap.explain.causes import LITTLE, MOUNT_M, Inputs, Suspect, rows_of_kind
+from evermap.explain.causes import LITTLE, MOUNT_M, RARE_P, Inputs, Suspect, rows_of_kind
 from evermap.explain.evidence import AnySession, Screen, SpatialSession, evidence_at, optimum_of, used_rows
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
 from evermap.explain.seeds import find_mount, find_scales, find_shape, find_single_scales
-from evermap.explain.shape import FEWEST, compare_shapes
+from evermap.explain.shape import FEWEST, compare_shapes, find_mirrored_part
 from evermap.explain.trial import FEWER, INLIER, NEAR, Asked, Trial, VisitT, count_changed
 from evermap.explain.triggers import (
     INNOVATIONS,
@@ -29,7 +31,8 @@ from evermap.explain.triggers import (
 from evermap.slam.clocks import FALLS, find_delay, find_pair_loss, late_by
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.mistakes import pairs_of
-from evermap.types import SlamResult, is_in_space
+from evermap.slam.orientations import MIRRORED
+from evermap.types import FloatArray, IntArray, SlamResult, is_in_space
 
 FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
@@ -91,11 +94,44 @@ def _by_shape(alone: SlamResult | None, inputs: Inputs, suspects: Iterable[Suspe
         placed = max(placed, now.placed)
         if now.placed >= PLACED and now.share > as_given.share + BETTER:
             found.append((now.share + suspect.p, suspect, 0.0))
+    mirrored = [gain for gain, one, _ in found if one.code == "map-mirrored"]
+    found += [(mirrored[0], one, 0.0) for one in suspects if mirrored and one.code == MIRRORED.code and not one.pairs]
+    part = None if found else find_mirrored_part(alone.landmarks, inputs.prior_map)
+    if part is not None:
+        found.append((as_given.share, _suspect_part(*part), 0.0))
     found.sort(key=lambda each: -each[0])
     for _, suspect, state in seeds:
         if suspect.of_map and (undone := suspect.undo(inputs, state).prior_map) is not None:
             placed = max(placed, compare_shapes(alone.landmarks, undone).placed)
     return found if placed > ELSEWHERE else elsewhere
+
+
+def _suspect_part(landmark_id: IntArray, position_m: FloatArray) -> Suspect:
+    """Return that a map has some landmarks as in a mirror, which the shape of a solution without it shows.
+
+    Args:
+        landmark_id: (K,) which.
+        position_m: (K, D) where they are in the frame of the map.
+    """
+    listed = ", ".join(map(str, landmark_id.tolist()))
+    return Suspect(
+        "map-mirrored", "map: a part", RARE_P, partial(_replace_in_map, landmark_id=landmark_id, position_m=position_m),
+        lambda _: (f"a part of the given map is mirrored: landmarks {listed}"),
+        lambda _: (f"--prior-map: the signs of the coordinates of {listed}"), of_map=True, pairs=False,
+    )  # fmt: skip
+
+
+def _replace_in_map(inputs: Inputs, _: float, landmark_id: IntArray, position_m: FloatArray) -> Inputs:
+    """Return the same with other places of some landmarks of the map, which knows no orientations of these then."""
+    given = inputs.prior_map
+    assert given is not None
+    at, rotation = given.position_m.copy(), given.rotation
+    _, row, of = np.intersect1d(given.landmark_id, landmark_id, return_indices=True)
+    at[row, : position_m.shape[1]] = position_m[of]
+    if rotation is not None:
+        rotation = rotation.copy()
+        rotation[row] = np.nan
+    return replace(inputs, prior_map=replace(given, position_m=at, rotation=rotation))
 
 
 def _is_of_map(suspect: Suspect, best: Trial[VisitT] | None, config: SlamConfig) -> bool:

@@ -17,6 +17,7 @@ from evermap.explain.scores import SessionScores
 from evermap.geometry import se2, se3
 from evermap.slam.association.features import medians
 from evermap.slam.gaps import find_gaps, is_outside
+from evermap.slam.ranges import compare_with_mirrored
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
@@ -215,6 +216,7 @@ class Signs:
             the poses, of those that are significant (`explain.scores`), and its words; 0 where none is.
         alternation: standard deviations by which errors of the odometry alternate from step to step.
         adrift: poses beside a break of the odometry, whose detections are not used.
+        hand: nats for the sign of turns, by where the sensor sits; nan where bearings or a map show it.
         dropped, bent_nats, lead_nats: of detections without identities (`AssociationEvidence`): share of no landmark,
             nats for each landmark met again, and log evidence over odometry alone.
     """
@@ -258,6 +260,7 @@ class Signs:
     held_name: str = ""
     alternation: float = nan
     adrift: float = nan
+    hand: float = nan
     dropped: float = nan
     bent_nats: float = nan
     lead_nats: float = nan
@@ -309,13 +312,14 @@ def measure_signs(
     inlier = result.innovations.p_inlier >= USED
     nis, found = comparable_nis(result.innovations), result.association
     fine = inlier & np.isfinite(nis)
+    lag = lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))
     is_in_map = prior_map is not None and result.landmarks.frame == "prior_map"
     seen, driven = _noise_over_start(result.parameters)
     return Signs(
         n_landmarks=len(result.landmarks),
         n_used=int(inlier.sum()),
         nis=float(nis[fine].mean()) if fine.any() else nan,
-        nis_lag=_or_nan(lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))),
+        nis_lag=nan if lag is None else float(lag),
         used=used,
         used_worst=worst,
         named=named,
@@ -347,6 +351,7 @@ def measure_signs(
         in_map=None if prior_map is None else is_in_map,
         alternatives=len(result.alternatives),
         n_unknown=_count_unknown(result),
+        hand=nan if is_in_map else compare_with_mirrored(result, recording),
         dropped=nan if found is None else found.dropped,
         bent_nats=nan if found is None else found.nats_per_closure,
         lead_nats=nan if found is None else found.lead_nats,
@@ -356,10 +361,6 @@ def measure_signs(
 def _count_unknown(result: SlamResult) -> int:
     tables = result.trajectory.pose_world_robot, result.landmarks.position_m
     return sum(int(np.count_nonzero(~np.isfinite(table).all(axis=1))) for table in tables)
-
-
-def _or_nan(value: float | None) -> float:
-    return nan if value is None else float(value)
 
 
 def _median(values: FloatArray) -> float:

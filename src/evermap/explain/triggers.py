@@ -80,11 +80,15 @@ def find_symptoms(
     if not found:
         single = find_single_scales(inputs.recording, result).values()
         found += [SINGLE] if any(abs(state) > LEAST_SINGLE for state in single) else []
-    if not found:
-        apart, _, longer = compare_odometry(result, inputs.recording.odometry)
-        if apart > ODOMETRY_OFF or abs(math.log(max(longer, 1e-9))) > LENGTH_OFF or _is_odometry_noisy(result):
-            found.append("odometry")
+    if not found and contradicts_odometry(result, inputs):
+        found.append("odometry")
     return tuple(found)
+
+
+def contradicts_odometry(result: SlamResult, inputs: Inputs) -> bool:
+    """Return whether a solution and its odometry differ by far more than odometry does, or hardly agree."""
+    apart, _, longer = compare_odometry(result, inputs.recording.odometry)
+    return apart > ODOMETRY_OFF or abs(math.log(max(longer, 1e-9))) > LENGTH_OFF or _is_odometry_noisy(result)
 
 
 def compare_sensors(inputs: Inputs) -> FloatArray:

@@ -188,6 +188,11 @@ LIMITS = (
         "blind", "blind_share", "nothing seen for {:.0%} of the drive", -inf, 0.5, WEAK,
         "there the poses are those of the odometry", "landmarks where nothing is seen",
     ),
+    Limit(
+        "mirrored", "hand", "{:.1f} nats for the sign of turns, by the side on which the sensor sits", 3.0, inf, WEAK,
+        "of ranges alone the drive fits as well mirrored",
+        "a map with surveyed positions, or one landmark that is known to be on the left",
+    ),
 )  # fmt: skip
 """In the order of what is told first.
 
@@ -326,7 +331,7 @@ def _decide(
     if some := [limit for limit in beyond if limit.kind is OUTDATED]:
         return OUTDATED, _reasons(some, alarming)
     if doubtful := [cause for cause in causes if cause.probability < SURE and not _is_put_right(cause)]:
-        return WEAK, _doubt_text(doubtful[0])
+        return _find_kind_in_doubt(doubtful[0]), _doubt_text(doubtful[0])
     if some := [limit for limit in beyond if limit.kind is WEAK]:
         return WEAK, _reasons(some, alarming)
     return VerdictKind.SOUND, "readings, odometry and solution agree"
@@ -341,6 +346,16 @@ def _is_put_right(cause: Cause) -> bool:
 
 def _is_of_map(cause: Cause) -> bool:
     return cause.subject.startswith("map") or cause.code.startswith("map")
+
+
+def _find_kind_in_doubt(cause: Cause) -> VerdictKind:
+    """Return the kind of a run of which one of two explanations holds: it can't be used if something is surely wrong.
+
+    States are integrated over 'as stated', too; what has none, and what may hold instead, are mistakes.
+    """
+    if not (isnan(cause.value) and cause.instead):
+        return WEAK
+    return OUTDATED if _is_of_map(cause) else SUSPECT
 
 
 def _cause_text(cause: Cause) -> str:

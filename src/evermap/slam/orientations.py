@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se3
-from evermap.slam.mistakes import CONVENTIONS, sighting_pairs
+from evermap.slam.mistakes import CONVENTIONS, Mistake, sighting_pairs
 from evermap.types import AnyRecordingT, BoolArray, FloatArray, SpatialRecording, is_in_space
 
 SAME = 1e-6
@@ -26,6 +26,25 @@ median, as must the rest of the turn in the world."""
 TELLS_RAD, SHARE_LEFT = 0.05, 0.7
 """Difference between two conventions, in the turn of a landmark from one sighting to another, from which these two say
 which is right; and share of the usual turn that is left at most where the other one is."""
+
+MIRRORED = Mistake(
+    "bearing-sign",
+    "bearings and turn rates seem to be clockwise, both: counter-clockwise is positive, from x ahead to y on the left "
+    "(bearing_rad, angular_radps)",
+    bearing=-1.0,
+    turn=-1.0,
+    lateral=-1.0,
+    field="bearing_rad, angular_radps",
+)
+"""What mirrors all that is measured in the plane: no pair of sightings shows it."""
+MIRRORED_TURNS = replace(
+    MIRRORED,
+    code="turn-sign",
+    message="turn rates seem to have the wrong sign: counter-clockwise is positive, from x ahead to y on the left "
+    "(angular_radps)",
+    field="angular_radps",
+)
+"""The same of ranges alone: their first bearings, which are guessed, follow the odometry."""
 
 
 def without_unmeasured(recording: AnyRecordingT, settings: CheckConfig) -> AnyRecordingT:

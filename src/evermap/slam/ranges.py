@@ -9,6 +9,7 @@ such as the mirrored one of a drive straight on; otherwise ranges from longer ag
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,13 +22,27 @@ from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import BIAS, CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive
-from evermap.types import ANY_BEARING_RAD, UNKNOWN, BoolArray, FloatArray, IntArray, Recording, landmark_label
+from evermap.types import (
+    ANY_BEARING_RAD,
+    UNKNOWN,
+    AnyRecording,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Recording,
+    SlamResult,
+    is_in_space,
+    landmark_label,
+)
 
 RANGE_ONLY = "a range without a bearing is located by what is seen later, which is not causal"
 """Why a robot cannot use it while it drives."""
 OF_MEDIAN, CHANGED, SWAY = 0.6745, 3.0, 0.02
 """Median of the sizes of normal numbers over their standard deviation; standard deviations of a difference from which
 the robot moved; and share of a range by which it may change as a robot stands."""
+
+INLIER, FEWEST = 0.5, 10
+"""Probability from which a detection is used, and bearings that are, from which they show the sign of turns."""
 
 
 class Ranged(NamedTuple):
@@ -217,3 +232,23 @@ def _normal(
     information = np.einsum("km,kma,kmb->kab", weight, row, row)
     information[:, 2, 2] += offset_m**-2
     return cost, gradient, information
+
+
+def compare_with_mirrored(result: SlamResult, recording: AnyRecording) -> float:
+    """Return by how much where the sensor sits speaks for the drive, not its mirror image [nats]; nan of bearings.
+
+    If y and the sign of turns are reversed, all ranges stay what they are, but that the sensor is on the other side.
+    """
+    if is_in_space(recording):
+        return math.nan
+    seen = recording.detections
+    with_bearing = np.isfinite(seen.bearing_rad) & ~(seen.sigma_bearing_rad >= ANY_BEARING_RAD)
+    used = result.innovations.detection[result.innovations.p_inlier >= INLIER]
+    if np.count_nonzero(with_bearing[used[used < len(seen)]]) >= FEWEST:
+        return math.nan
+    left = next((one for one in result.parameters if one.name == "mount_left_m" and one.prior_sigma > 0.0), None)
+    if left is None:
+        return math.nan
+    stated_m = float(recording.sensor.mount_robot_sensor[1])
+    mirrored_m = -2.0 * stated_m - left.value
+    return 0.5 * ((mirrored_m - left.prior_mean) ** 2 - (left.value - left.prior_mean) ** 2) / left.prior_sigma**2

@@ -123,6 +123,7 @@ ANSWERS = {
     "map scale": _answer(OUTDATED, "map-scale map-unit scale", "scale " + _UNITS),
     "map mirror": _answer(OUTDATED, "map-mirror map-mirrored mirrored mirrored-map", "mirror"),
     "map site": _answer(OUTDATED | LOST, _SITES, "site map"),
+    "map part": _answer(OUTDATED | LOST, _SITES + "map-mirrored", "site map mirror"),
     "map axes": _answer(
         OUTDATED | LOST, _SITES + "map-axes map-mirror map-mirrored mirrored-map map-tag-axes tag-axes", "axes map"
     ),

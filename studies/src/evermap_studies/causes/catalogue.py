@@ -450,7 +450,7 @@ def _causes() -> list[World]:
         seeds=5,
         values=(1.06, 1 / 1.06, 0.06),
     )
-    some.add("laser corners", "half of the map mirrored", "map site", wrong.map_mirrored(half=True), maps=MAP, seeds=5)
+    some.add("laser corners", "half of the map mirrored", "map part", wrong.map_mirrored(half=True), maps=MAP, seeds=5)
     return some.worlds
 
 
@@ -624,8 +624,17 @@ def _attacks() -> list[World]:
     add("laser corners poses", "sensor turned by 180 deg", "mount", wrong.mounted(yaw=math.pi), seeds=3)
     add("laser corners", "identities off by one", "other numbers", wrong.renumbered(1), maps=MAP, seeds=3)
     add("laser corners", "map in feet", "map scale", wrong.map_scaled(1 / 0.3048), maps=MAP, seeds=3)
+    # in the plane this is a right map of bearings that are clockwise: one cause
     add(
-        "laser corners poses",
+        "laser",
+        "sign of turning, in a mirrored map",
+        "bearing sign",
+        wrong.both(wrong.odometer(turn=-1.0), wrong.map_mirrored(1)),
+        maps=MAP,
+        seeds=3,
+    )
+    add(
+        "corners poses",
         "sign of turning, in a mirrored map",
         "turn sign",
         wrong.both(wrong.odometer(turn=-1.0), wrong.map_mirrored(1)),

@@ -239,6 +239,10 @@ def named_by(world: World, answer: Answer, solved: Solved, missed: int, truth: M
             return "cause"
         if any(end in (pair.one.name, pair.other.name) for pair in result.undecided for end in answer.states):
             return "undecided"
+        verdict = result.verdict
+        symptoms = verdict.symptoms if verdict is not None and verdict.kind is VerdictKind.WEAK else ()
+        if any(one.is_alarming and one.code in answer.codes for one in symptoms):
+            return "undecided"
         for state in result.parameters:
             if not any(state.name.endswith(end) for end in answer.states) or state.fixed or not state.sigma > 0.0:
                 continue
