@@ -59,6 +59,10 @@ class Limit:
 LOST, WEAK, OUTDATED, SUSPECT = (
     VerdictKind.LOST, VerdictKind.WEAK, VerdictKind.MAP_OUTDATED, VerdictKind.SENSOR_SUSPECT
 )  # fmt: skip
+SURE = 0.9
+"""Probability from which a cause is told as such."""
+LEAST_HAND = -2.3
+"""Nats from which the drive is mirrored with less than a hundredth: of a thousand robots one has the sign wrong."""
 WORST_NIS = 8.0
 """Four times the expectation of two numbers: errors are twice as large as they are said to be."""
 LIMITS = (
@@ -189,8 +193,8 @@ LIMITS = (
         "there the poses are those of the odometry", "landmarks where nothing is seen",
     ),
     Limit(
-        "mirrored", "hand", "{:.1f} nats for the sign of turns, by the side on which the sensor sits", 3.0, inf, WEAK,
-        "of ranges alone the drive fits as well mirrored",
+        "mirrored", "hand", "{:.1f} nats for the sign of turns, by the side on which the sensor sits", LEAST_HAND, inf,
+        WEAK, "of ranges alone the drive fits better mirrored",
         "a map with surveyed positions, or one landmark that is known to be on the left",
     ),
 )  # fmt: skip
@@ -201,8 +205,6 @@ are held out. Those of detections without identities are the settings of `slam.a
 """
 FEWEST_MOVED = 3
 """Changed landmarks from which a map is outdated: fewer are changes, whatever share they are."""
-SURE = 0.9
-"""Probability from which a cause is told as such."""
 PUT_RIGHT, MOST_TURNED = frozenset({"clock", "turn-bias", "turn-scale"}), 0.3
 """Causes that leave a solution right that has taken them in; and the logarithm of a scale from which turns are another
 unit, or of another robot."""
