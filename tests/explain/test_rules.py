@@ -92,6 +92,7 @@ def test_a_cause_must_explain_something_that_was_asked(
     monkeypatch.setattr(competition, "count_changed", lambda result: changed[result])
     monkeypatch.setattr(competition, "share_rejected", lambda result: rejected[result])
     monkeypatch.setattr("evermap.explain.trial.find_score", lambda solution, _: unexplained[solution.result])
+    monkeypatch.setattr(competition, "contradicts_odometry", lambda result, _: False)
     assert competition._relieves(now, best, SlamConfig()) is relieves
 
 

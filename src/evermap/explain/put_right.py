@@ -28,19 +28,17 @@ commands are stamped before the robot follows them, at most."""
 
 
 def find_late_sensor(result: SlamResult, inputs: Inputs) -> Taken | None:
-    """Return by how much stamps of the sensor are late (early: negative), where motions in the plane seem early (late).
+    """Return by how much stamps of the sensor are late, where measured motions in the plane seem early.
 
-    Motions that were measured were when they are stamped, so the detections are what is late, or early: at their stamps
-    the robot is not where it was when they were taken. Commands are stamped before, but no robot follows them so late
-    as `LONGEST_LEAD_S`, and none before. In space delays are those of the sensors, too.
+    Nothing stamps a motion before it was, so what is late are the detections: at their stamps the robot is not where
+    it was when they were taken. Commands are stamped before, but no robot follows them so late as `LONGEST_LEAD_S`. In
+    space delays are those of the sensors.
     """
     if is_in_space(inputs.recording):
         return None
-    delay, is_measured = find_odometry_delay(result), inputs.recording.odometry.is_measured
-    if delay is None or not delay.p_needed > SURE:
-        return None
-    late_s = abs(delay.value) if is_measured else -delay.value
-    if not late_s > max(LEAST_LATE_S if is_measured else LONGEST_LEAD_S, SURELY * delay.sigma):
+    delay = find_odometry_delay(result)
+    least_s = LEAST_LATE_S if inputs.recording.odometry.is_measured else LONGEST_LEAD_S
+    if delay is None or not (delay.p_needed > SURE and -delay.value > max(least_s, SURELY * delay.sigma)):
         return None
     suspect = next(one for one in list_suspects(inputs, calibrations=True) if one.code == CLOCK)
     return Taken(suspect, -delay.value, delay.sigma**-2)
