@@ -203,11 +203,15 @@ def test_one_map_in_another_metre_is_likelier_than_ranges_and_odometer_that_err_
     assert error_m(result, recording, in_map=True) < 0.02
 
 
-def test_a_mirrored_map_is_named() -> None:
+def test_a_mirrored_map_is_named_beside_readings_that_are() -> None:
     recording, survey = recorded(World(seed=6), "plane")
     mirrored = replace(survey, position_m=survey.position_m * [1.0, -1.0])
     result = run_slam(recording, prior_map=mirrored)
-    assert named(result, "map-mirrored").fix
+    (cause,) = result.causes
+    assert "the given map is mirrored" in cause.message + cause.instead
+    assert "clockwise, both" in cause.message + cause.instead
+    assert cause.fix
+    assert cause.probability == pytest.approx(0.5, abs=0.05)
     assert result.changes == ()
 
 

@@ -96,6 +96,21 @@ def test_a_cause_must_explain_something_that_was_asked(
     assert competition._relieves(now, best, SlamConfig()) is relieves
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "relieves"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_cause_relieves_that_makes_a_solution_agree_with_its_odometry(
+    before: bool, after: bool, relieves: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though as many landmarks seem to have moved."""
+    best, now = trial(0.0, result=0), trial(1.0, result=1)
+    monkeypatch.setattr(competition, "find_symptoms", lambda *_: ("changes", "map"))
+    monkeypatch.setattr(competition, "count_changed", lambda _: 3)
+    monkeypatch.setattr(competition, "share_rejected", lambda _: 0.2)
+    monkeypatch.setattr(competition, "contradicts_odometry", lambda result, _: (before, after)[result])
+    assert competition._relieves(now, best, SlamConfig()) is relieves
+
+
 def test_a_state_costs_how_unusual_it_is_and_how_well_it_is_known() -> None:
     one = suspect(sigma=0.3)
     unknown, usual = (_state_evidence(Taken(one, state)) for state in (0.6, 0.0))

@@ -391,10 +391,10 @@ def test_command_runs_what_is_asked_for(
         return {"runs": []}
 
     monkeypatch.setattr(nielsen2024, "reproduce", fake)
-    commands.nielsen2024(tmp_path, tmp_path / "out", part=["search"], dataset=[3], as_json=True)
+    commands.nielsen2024(tmp_path, tmp_path / "out", part=["search"], only=["dataset=3"], as_json=True)
     assert json.loads(capsys.readouterr().out) == {"runs": []}
     assert asked["settings"] == replace(nielsen2024.Settings(), parts=("search",), datasets=(3,))
-    commands.nielsen2024(tmp_path, tmp_path / "out", method=["em"], quick=True, jobs=3, as_json=True)
+    commands.nielsen2024(tmp_path, tmp_path / "out", only=["method=em"], quick=True, jobs=3, as_json=True)
     assert asked["settings"] == replace(nielsen2024.QUICK, methods=("em",), processes=3)
 
 
