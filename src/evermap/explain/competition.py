@@ -108,7 +108,7 @@ def explain(
     for _ in range(rules.most_causes):
         given = inputs if best is None else best.inputs  # what is wrong with the drive bends its shape
         alone = _solve_alone(best, given, solve_under, rules.rejected, budget)
-        shown = (partial(screen_plain, alone=alone), *screens[1:])
+        shown: tuple[Callable[..., Asked], ...] = (partial(screen_plain, alone=alone), *screens[1:])
         found = _next_cause(best, inputs, solve_under, config, budget, weighed, shown)
         if found is None:
             break

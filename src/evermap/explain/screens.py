@@ -116,8 +116,8 @@ def _suspect_part(landmark_id: IntArray, position_m: FloatArray) -> Suspect:
     listed = ", ".join(map(str, landmark_id.tolist()))
     return Suspect(
         "map-mirrored", "map: a part", RARE_P, partial(_replace_in_map, landmark_id=landmark_id, position_m=position_m),
-        lambda _: (f"a part of the given map is mirrored: landmarks {listed}"),
-        lambda _: (f"--prior-map: the signs of the coordinates of {listed}"), of_map=True, pairs=False,
+        lambda _: f"a part of the given map is mirrored: landmarks {listed}",
+        lambda _: f"--prior-map: the signs of the coordinates of {listed}", of_map=True, pairs=False,
     )  # fmt: skip
 
 
@@ -126,7 +126,7 @@ def _replace_in_map(inputs: Inputs, _: float, landmark_id: IntArray, position_m:
     given = inputs.prior_map
     assert given is not None
     at, rotation = given.position_m.copy(), given.rotation
-    _, row, of = np.intersect1d(given.landmark_id, landmark_id, return_indices=True)
+    row, of = np.intersect1d(given.landmark_id, landmark_id, return_indices=True)[1:]
     at[row, : position_m.shape[1]] = position_m[of]
     if rotation is not None:
         rotation = rotation.copy()
