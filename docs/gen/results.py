@@ -59,6 +59,7 @@ LONGEST = ("soak", "nielsen2024")
 PAGE = "results.md"
 PROVENANCE = re.compile(r"Computed by `(?P<command>[^`]+)`\. Tables of commit `(?P<commit>\w+)`, (?P<date>[\d-]+)")
 ROWS_OF = re.compile(r"^Rows of commits? `(?P<commit>[\w+]+)`, (?P<date>[\d-]+)")
+TOOK = re.compile(r"in \d+ s\b")
 MEASURED = re.compile(r"^<!-- measured: (?P<commit>\w+), (?P<date>[\d-]+) -->$")
 NOT_MEASURED = re.compile(r"^<!-- not measured: .+ -->$")
 CLAIMED = ("expected", "asked for")
@@ -511,8 +512,8 @@ def _count_distinguishing_cells(*bodies: list[list[str]]) -> int:
 def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], list[list[str]], str]]:
     """Yield the tables of a section.
 
-    Each as what distinguishes it from the others (the paragraph before, unless it names commits, and the head), its
-    rows with their commits, and its text.
+    Each as what distinguishes it from the others (the paragraph before but for how long it took, unless it names
+    commits, and the head), its rows with their commits, and its text.
     """
     blocks = [block for block in section.split("\n\n") if block.strip()]
     for before, block in zip(["", *blocks], blocks, strict=False):
@@ -521,7 +522,7 @@ def _tables_of(section: str, code: str) -> Iterator[tuple[tuple[str, ...], list[
         head, _, *body = [cells(line) for line in block.splitlines()]
         own = head[-1] == CODE
         rows = [row if own else [*row, code] for row in body]
-        paragraph = "" if before.startswith(("#", "|")) or ROWS_OF.match(before) else before
+        paragraph = "" if before.startswith(("#", "|")) or ROWS_OF.match(before) else TOOK.sub("in … s", before)
         yield (paragraph, *(head[:-1] if own else head)), rows, block
 
 

@@ -144,6 +144,13 @@ def test_a_run_of_a_part_keeps_rows_and_sections_of_an_older_one_with_their_comm
     assert results.merge_pages(old, old, "a", "b") == old
 
 
+def test_a_table_is_the_same_however_long_its_run_took() -> None:
+    page = "### One\n\nTen runs, seed 0, in {} s.\n\n| a | b |\n| --- | ---: |\n| x | {} |"
+    old, new = page.format(751, 1), page.format(350, 2)
+    assert results.merge_pages(old, new, "a", "b") == new
+    assert "| x | 1 | a |" in results.merge_pages(old, new.replace("seed 0", "seed 1"), "a", "b")
+
+
 def test_every_page_of_a_study_is_listed() -> None:
     assert {path.stem for path in (DOCS / "results").glob("*.md")} == set(results.STUDIES)
 
