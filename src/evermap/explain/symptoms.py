@@ -315,6 +315,9 @@ def measure_signs(
     lag = lag1_autocorrelation(nis[fine], result.innovations.landmark_id[fine].astype(np.float64))
     is_in_map = prior_map is not None and result.landmarks.frame == "prior_map"
     seen, driven = _noise_over_start(result.parameters)
+    points = int(np.isfinite(compared.point_m[compared.used]).all(axis=1).sum())  # ranges with their directions
+    has_sign = is_in_map or points >= FEWEST
+    hand = nan if has_sign or is_in_space(recording) else compare_with_mirrored(result, recording)
     return Signs(
         n_landmarks=len(result.landmarks),
         n_used=int(inlier.sum()),
@@ -351,7 +354,7 @@ def measure_signs(
         in_map=None if prior_map is None else is_in_map,
         alternatives=len(result.alternatives),
         n_unknown=_count_unknown(result),
-        hand=nan if is_in_map else compare_with_mirrored(result, recording),
+        hand=hand,
         dropped=nan if found is None else found.dropped,
         bent_nats=nan if found is None else found.nats_per_closure,
         lead_nats=nan if found is None else found.lead_nats,

@@ -25,13 +25,11 @@ from evermap.slam.problem import Drive
 from evermap.types import (
     ANY_BEARING_RAD,
     UNKNOWN,
-    AnyRecording,
     BoolArray,
     FloatArray,
     IntArray,
     Recording,
     SlamResult,
-    is_in_space,
     landmark_label,
 )
 
@@ -40,9 +38,6 @@ RANGE_ONLY = "a range without a bearing is located by what is seen later, which 
 OF_MEDIAN, CHANGED, SWAY = 0.6745, 3.0, 0.02
 """Median of the sizes of normal numbers over their standard deviation; standard deviations of a difference from which
 the robot moved; and share of a range by which it may change as a robot stands."""
-
-INLIER, FEWEST = 0.5, 10
-"""Probability from which a detection is used, and bearings that are, from which they show the sign of turns."""
 
 
 class Ranged(NamedTuple):
@@ -234,18 +229,12 @@ def _normal(
     return cost, gradient, information
 
 
-def compare_with_mirrored(result: SlamResult, recording: AnyRecording) -> float:
-    """Return by how much where the sensor sits speaks for the drive, not its mirror image [nats]; nan of bearings.
+def compare_with_mirrored(result: SlamResult, recording: Recording) -> float:
+    """Return by how much where the sensor sits speaks for a drive that has ranges alone, not its mirror image [nats].
 
-    If y and the sign of turns are reversed, all ranges stay what they are, but that the sensor is on the other side.
+    If y and the sign of turns are reversed, all ranges stay what they are, but that the sensor is on the other side;
+    nan where that is not estimated.
     """
-    if is_in_space(recording):
-        return math.nan
-    seen = recording.detections
-    with_bearing = np.isfinite(seen.bearing_rad) & ~(seen.sigma_bearing_rad >= ANY_BEARING_RAD)
-    used = result.innovations.detection[result.innovations.p_inlier >= INLIER]
-    if np.count_nonzero(with_bearing[used[used < len(seen)]]) >= FEWEST:
-        return math.nan
     left = next((one for one in result.parameters if one.name == "mount_left_m" and one.prior_sigma > 0.0), None)
     if left is None:
         return math.nan
