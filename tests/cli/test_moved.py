@@ -40,14 +40,14 @@ def options(verb: str) -> dict[str, Any]:
     return options_of(dict(verbs())[verb])
 
 
-def shown(verb: str) -> set[str]:
+def list_shown(verb: str) -> set[str]:
     """Options that the help of a verb lists."""
     return {one.opts[0] for one in options(verb).values() if not one.hidden} - {"--help"}
 
 
 @pytest.mark.parametrize("verb", [name for name, _ in verbs()])
 def test_a_verb_has_at_most_ten_options(verb: str) -> None:
-    assert len(shown(verb)) <= MOST
+    assert len(list_shown(verb)) <= MOST
 
 
 @pytest.mark.parametrize("group", ["evermap.verbs", "evermap.studies"])
@@ -169,7 +169,7 @@ def test_every_old_option_has_a_line_here_and_is_hidden() -> None:
         lines = [shlex.split(line.replace("=", " ", 1)) for line in [*NEW, *STILL] if line.startswith(verb)]
         assert {name for name in moved if not any(name in line for line in lines)} == set(), verb
         kept = {"--lifetimes", "--prior"}  # of export itself, and of map enter
-        assert not moved.keys() & shown(verb) - kept, verb
+        assert not moved.keys() & list_shown(verb) - kept, verb
 
 
 def test_new_lines_are_left_as_they_are() -> None:

@@ -94,7 +94,7 @@ def live(
       evermap live building.evermap --sensor sensor.toml --zenoh tcp/localhost:7447 --foxglove 8765
     """
     from evermap.io import read_recording
-    from evermap.live.wires import Mailbox, wires_of
+    from evermap.live.wires import Mailbox
     from evermap.maps.store import is_address
     from evermap.slam.plane import in_its_space
 
@@ -112,7 +112,7 @@ def live(
     _check_needed(recording, chosen, sensor, topics, connected=connected)
     mailbox = Mailbox() if replay is None else None
     drive = _Drive(Path(map_file), chosen, sensor, topics, mailbox, recording)
-    with _opened(wires_of(zenoh, foxglove, mailbox)) as wires:
+    with _connect(zenoh, foxglove, mailbox) as wires:
         drive.run(wires, localize=localize, realtime=realtime, as_json=as_json)
 
 
@@ -132,19 +132,21 @@ def play(
       evermap play tuesday --zenoh listen=tcp/localhost:7447
     """
     from evermap.io import read_recording
-    from evermap.live.wires import wires_of
 
     if zenoh is None and foxglove is None:
         raise ConfigError("no connection", field="zenoh", hint="--zenoh tcp/localhost:7447, or --foxglove 8765")
     recording = read_recording(input, robot=robot)
     _check_ranges(recording, configured(None, None))
-    with _opened(wires_of(zenoh, foxglove, None)) as wires:
+    with _connect(zenoh, foxglove, None) as wires:
         _be_the_robot(recording, wires, as_json=as_json)
 
 
 @contextmanager
-def _opened(wires: Sequence[Wire]) -> Iterator[Sequence[Wire]]:
-    """Close connections in the end."""
+def _connect(zenoh: str | None, foxglove: str | None, mailbox: Mailbox | None) -> Iterator[Sequence[Wire]]:
+    """Open connections, and close them in the end."""
+    from evermap.live.wires import wires_of
+
+    wires = wires_of(zenoh, foxglove, mailbox)
     try:
         yield wires
     finally:

@@ -331,16 +331,21 @@ def _rewrite_cluster(line: Line) -> None:
     line.options.append(("--workers", address))
 
 
+def _rewrite_example(line: Line, kind: str) -> bool:
+    """Rewrite `--init FILE`, beside which nothing else was read; return whether it was given."""
+    found = line.has("--init")
+    if found:
+        line.verb, line.arguments, line.options = ("init",), [kind, line.take("--init") or ""], []
+    return found
+
+
 def _rewrite_persist(line: Line) -> None:
-    if line.has("--init"):
-        line.verb, line.arguments, line.options = ("init",), ["looks", line.take("--init") or ""], []
-        return
-    _rewrite_cluster(line)
+    if not _rewrite_example(line, "looks"):
+        _rewrite_cluster(line)
 
 
 def _rewrite_track(line: Line) -> None:
-    if line.has("--init"):
-        line.verb, line.arguments, line.options = ("init",), ["detections", line.take("--init") or ""], []
+    if _rewrite_example(line, "detections"):
         return
     texts = [value or "" for name, value in line.options if name == "--speed"]
     if texts:

@@ -106,7 +106,6 @@ def ask(
     show: bool = False,
     prior_map: str | None = None,
     shift: Sequence[str] | None = None,
-    inputs: Sequence[str | Path | None] = (),
     **given: Any,
 ) -> RunRequest:
     """Return what a command line asks for, with the configuration in force.
@@ -119,7 +118,6 @@ def ask(
         show: print the configuration and exit.
         prior_map: 'truth', or a file; with or without `,sigma=M`.
         shift: as of `evermap.io.parse_shift`.
-        inputs: further files that are read.
         given: further fields.
     """
     flags = {"unknown_ids": unknown_ids or None}
@@ -131,7 +129,8 @@ def ask(
 
         shifts = [parse_shift(text) for text in shift]
     survey, sigma_m = (None, SURVEY_SIGMA_M) if prior_map is None else _parse_prior_map(prior_map)
-    read = [*paths, config, given.get("topics"), None if survey == "truth" else survey, *inputs]
+    survey_file = None if survey == "truth" else survey
+    read = [*paths, config, given.get("topics"), survey_file, given.get("map_file")]
     return RunRequest(chosen, set_here, read, prior_map=survey, prior_sigma_m=sigma_m, shifts=shifts, **given)
 
 
