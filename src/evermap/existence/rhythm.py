@@ -8,6 +8,7 @@ absence is a sequence of survived moments, so its hazard is such a rate.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -52,6 +53,17 @@ class Rhythm(Shown):
     def factor(self) -> FloatArray:
         """(1008,) by what the hazard is multiplied."""
         return np.asarray(np.exp(self.log_factor), dtype=np.float64)
+
+    def elapsed_s(self, stamp_s: ArrayLike) -> FloatArray:
+        """Return the integral (...) of the factor from a Monday 00:00 until stamps (...): a clock that runs as fast as
+        things happen. What is not finite stays as it is.
+        """
+        stamps = np.asarray(stamp_s, dtype=np.float64)
+        until = np.append(0.0, np.cumsum(BIN_S * self.factor))
+        with np.errstate(invalid="ignore"):
+            weeks, phase = np.divmod(stamps - MONDAY_S, WEEK_S)
+            passed = weeks * until[-1] + np.interp(phase, BIN_S * np.arange(BINS + 1), until)
+        return np.asarray(np.where(np.isfinite(stamps), passed, stamps))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, for JSON."""
@@ -129,7 +141,7 @@ HALF_AN_EVENT = 0.5
 """Added to every table where the exposure is, so that no rate is zero (Jeffreys' prior of a Poisson rate)."""
 DAY_KNOTS = 72
 DEVIATION_KNOTS = 12
-_WEAK = 1e-5
+WEAK = 1e-5
 """Precision of the prior of directions that no penalty reaches."""
 _WEEKEND = 0.03
 """Precision of the prior of the weekend's log factor: a factor of e^6 is one standard deviation."""
@@ -188,19 +200,19 @@ def age_basis(log_age: FloatArray, knots: int) -> Basis:
     return Basis(columns, (difference.T @ difference,), np.zeros((columns.shape[1],) * 2))
 
 
-def week_basis() -> Basis:
+def week_basis(bins_of_day: int = BINS_OF_DAY, knots: int = DAY_KNOTS) -> Basis:
     """Return a daily curve shared by all days, a weekend, and a level and a smoother curve of each day of the week."""
-    time = (np.arange(BINS_OF_DAY) + 0.5) / BINS_OF_DAY
-    shared, own = cyclic_spline(time, DAY_KNOTS), cyclic_spline(time, DEVIATION_KNOTS)
-    weekend = np.repeat(np.arange(7) >= 5, BINS_OF_DAY)[:, None].astype(np.float64)
-    levels = np.repeat(np.eye(7), BINS_OF_DAY, axis=0)
+    time = (np.arange(bins_of_day) + 0.5) / bins_of_day
+    shared, own = cyclic_spline(time, knots), cyclic_spline(time, DEVIATION_KNOTS)
+    weekend = np.repeat(np.arange(7) >= 5, bins_of_day)[:, None].astype(np.float64)
+    levels = np.repeat(np.eye(7), bins_of_day, axis=0)
     columns = np.hstack([np.tile(shared, (7, 1)), weekend, levels, np.kron(np.eye(7), own)])
-    starts = np.cumsum([0, DAY_KNOTS, 1, 7])
+    starts = np.cumsum([0, knots, 1, 7])
     size = columns.shape[1]
 
     rough = _cyclic_difference(DEVIATION_KNOTS) + 0.05 * np.eye(DEVIATION_KNOTS)
     penalties = (
-        _padded(_cyclic_difference(DAY_KNOTS), int(starts[0]), size),
+        _padded(_cyclic_difference(knots), int(starts[0]), size),
         _padded(np.eye(7), int(starts[2]), size),
         _padded(np.asarray(np.kron(np.eye(7), rough), dtype=np.float64), int(starts[3]), size),
     )
@@ -234,7 +246,7 @@ def fit(
     columns_week = week.columns if week else np.zeros((exposure.shape[1], 0))
     p, q = age.columns.shape[1], columns_week.shape[1]
     penalties = [_padded(penalty, 0, p + q) for penalty in age.penalties]
-    fixed = _WEAK * np.eye(p + q) + _padded(age.fixed, 0, p + q)
+    fixed = WEAK * np.eye(p + q) + _padded(age.fixed, 0, p + q)
     if week:
         penalties += [_padded(penalty, p, p + q) for penalty in week.penalties]
         fixed += _padded(week.fixed, p, p + q)
@@ -242,10 +254,38 @@ def fit(
     beta = np.concatenate([np.full(p, np.log(counted.sum() / total)), np.zeros(q)])
     if start is not None and len(start.coefficients) == p + q:
         beta, weights = start.coefficients, start.weights
+
+    def maximise(beta: FloatArray, penalty: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return _newton(beta, counted, exposure, age.columns, columns_week, penalty)
+
+    beta, weights, freedom = find_smoothness(maximise, beta, weights, penalties, fixed)
+    log_age, log_week = age.columns @ beta[:p], columns_week @ beta[p:]
+    level = float(counted.sum(0) @ log_week / counted.sum())
+    return SmoothRates(log_age + level, log_week - level, freedom, beta, weights)
+
+
+def find_smoothness(
+    maximise: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+    beta: FloatArray,
+    weights: FloatArray,
+    penalties: Sequence[FloatArray],
+    fixed: FloatArray,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return coefficients (P,), weights (M,) of the penalties of largest marginal likelihood, and the effective number
+    of parameters.
+
+    Args:
+        maximise: takes coefficients to begin with and a penalty (P, P), and returns the most probable ones and their
+            covariance (P, P).
+        beta: coefficients to begin with.
+        weights: of the penalties, to begin with.
+        penalties: M matrices (P, P).
+        fixed: (P, P) penalty that always holds.
+    """
     freedom = 0.0
     for _ in range(_MAX_ROUNDS):
-        penalty = fixed + sum((w * m for w, m in zip(weights, penalties, strict=True)), np.zeros_like(fixed))
-        beta, covariance = _newton(beta, counted, exposure, age.columns, columns_week, penalty)
+        penalty = weigh_penalties(weights, penalties, fixed)
+        beta, covariance = maximise(beta, penalty)
         prior = np.linalg.inv(penalty)
         updated = np.array(
             [
@@ -254,12 +294,15 @@ def fit(
             ]
         )
         weights = np.clip(updated, _ROUGHEST, _SMOOTHEST)
-        before, freedom = freedom, p + q - float(np.sum(covariance * penalty))
+        before, freedom = freedom, len(beta) - float(np.sum(covariance * penalty))
         if abs(freedom - before) < _SETTLED:
             break
-    log_age, log_week = age.columns @ beta[:p], columns_week @ beta[p:]
-    level = float(counted.sum(0) @ log_week / counted.sum())
-    return SmoothRates(log_age + level, log_week - level, freedom, beta, weights)
+    return beta, weights, freedom
+
+
+def weigh_penalties(weights: FloatArray, penalties: Sequence[FloatArray], fixed: FloatArray) -> FloatArray:
+    """Return the sum (P, P) of weighted penalties (P, P) and of the one that always holds."""
+    return np.asarray(fixed + sum((w * m for w, m in zip(weights, penalties, strict=True)), np.zeros_like(fixed)))
 
 
 def _newton(
