@@ -94,7 +94,7 @@ def show(
     """
     from evermap.io.landmarks import up_dict
     from evermap.maps.store import open_store
-    from evermap.runs.map_dicts import landmark_dicts, life_dicts, prior_dicts
+    from evermap.runs.map_dicts import hours_dict, landmark_dicts, life_dicts, prior_dicts
     from evermap.survival.durations import parse_duration_s
     from evermap.types import json_number, stamp_text
 
@@ -115,7 +115,7 @@ def show(
             "clock": living.clock.value,
         }
         about["up"] = up_dict(living.landmarks().up)
-        told = {"priors": prior_dicts(living), "lifetimes": life_dicts(living)}
+        told = {"priors": prior_dicts(living), "lifetimes": life_dicts(living), **hours_dict(living)}
         print_json({**about, "ahead_s": ahead_s, "landmarks": content, **told})
         return
     listed = [

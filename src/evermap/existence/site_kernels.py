@@ -181,12 +181,13 @@ def renew(
         route: (R, W) where one that leaves a seat goes; what is missing to 1 stays.
         moves: (R,) sum of that.
         death_old: (R, M) odds of leaving, in each step, of those that have been there since before.
-        death_new: (R, M) odds of leaving of those that came: in the rest of the step then, and in each one after it.
+        death_new: (R, M, M) odds of leaving of those that came in each step: in the rest of that, and in each one after
+            it; (R, 1, M) where it does not matter when they came.
         old: (R,) probabilities, updated in place.
         new: (R,) filled in: of those that came in the meantime.
         began: (R,) filled in: when that was on average, in steps; the middle of the gap where none came.
     """
-    steps = death_old.shape[1]
+    steps, when = death_old.shape[1], death_new.shape[1] > 1
     come = np.zeros((old.size, steps))
     again = np.zeros(old.size)
     for c in range(seat.size - 1):
@@ -196,13 +197,13 @@ def renew(
                 leaving = again[s] + old[s] * _share(death_old[s, m])
                 old[s] *= _rest(death_old[s, m], moves[s])
                 for j in range(m):
-                    leaving += come[s, j] * _share(death_new[s, m - j])
-                    come[s, j] *= _rest(death_new[s, m - j], moves[s])
+                    leaving += come[s, j] * _share(death_new[s, j * when, m - j])
+                    come[s, j] *= _rest(death_new[s, j * when, m - j], moves[s])
                 for t in range(high - low):
                     come[low + t, m] += leaving * route[s, t]
             for s in range(low, high):
-                again[s] = come[s, m] * _share(death_new[s, 0])
-                come[s, m] *= _rest(death_new[s, 0], moves[s])
+                again[s] = come[s, m] * _share(death_new[s, m * when, 0])
+                come[s, m] *= _rest(death_new[s, m * when, 0], moves[s])
         for s in range(low, high):
             for t in range(high - low):
                 come[low + t, steps - 1] += again[s] * route[s, t]

@@ -21,6 +21,7 @@ from evermap.errors import InputError
 from evermap.existence import protocol as checks
 from evermap.existence.lifetimes import log_death_odds
 from evermap.existence.recursion import LOG_LARGEST
+from evermap.existence.rhythm import Rhythm
 from evermap.sensing.sightlines import Lines
 from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
@@ -157,6 +158,9 @@ class SiteDynamics(Shown):
         return_share: (S,) probability that what turns up does so at this site, at most 1 in sum of a clique; the rest
             turns up at places that are not known, which is 'away'. One that hops from a site has the shares of the
             others and of unknown places, scaled to sum 1. 0 for a clique that never returns.
+        rhythm: by whose clock the ages of stays are counted of `hourly` cliques; those of absences, and of all where it
+            is None, are on the wall.
+        hourly: (C,) cliques; none where None.
     """
 
     stay: tuple[LifetimePrior, ...]
@@ -165,6 +169,8 @@ class SiteDynamics(Shown):
     away_since_s: FloatArray
     p_hop: FloatArray
     return_share: FloatArray
+    rhythm: Rhythm | None = None
+    hourly: BoolArray | None = None
 
 
 class SiteSensor(NamedTuple):
@@ -257,6 +263,8 @@ def _check_sites(
         "key": (looks.key, n_looks), "hit": (looks.hit, n_looks), "misses": (lines.misses, len(lines.hits)),
         "p_free": (lines.p_free, len(lines.hits)),
     }  # fmt: skip
+    if dynamics.hourly is not None:
+        lengths["hourly"] = dynamics.hourly, n_cliques
     for field, (column, n) in lengths.items():
         shape = (len(column),) if isinstance(column, tuple) else np.shape(column)
         if shape != (n,):
@@ -464,19 +472,69 @@ def _predicted(
     since = chains.by_row(dynamics.since_s, dynamics.away_since_s)
     route, moves = chains.routes(dynamics.p_hop, dynamics.return_share, pinned)
     gap_s = (frames.stamp_s[frames.first[:-1]] - start)[chains.clique]
-    age = np.maximum(start[chains.clique] - since, 0.0)
-    brief = odds(priors, prior, np.stack([age, np.zeros(len(age))], 1), np.stack([age + gap_s, gap_s], 1)) < SELDOM
+    start_s, clock = start[chains.clique], _SeatClock.of(dynamics, chains)
+    age = clock.age_s(since, start_s)
+    passed = gap_s if clock.rhythm is None else clock.age_s(start_s, start_s + gap_s)
+    brief = odds(priors, prior, np.stack([age, np.zeros(len(age))], 1), np.stack([age + passed, passed], 1)) < SELDOM
     steps = 1 if brief.all() else STEPS
     step_s = gap_s / steps
     new, came = np.zeros(len(since)), np.zeros(len(since))
     edges = age[:, None] + np.arange(steps + 1) * step_s[:, None]
     since_middle = np.maximum(np.arange(steps + 1) - 0.5, 0.0) * step_s[:, None]
-    death_old, death_new = (odds(priors, prior, age_s[:, :-1], age_s[:, 1:]) for age_s in (edges, since_middle))
+    death_new = odds(priors, prior, since_middle[:, :-1], since_middle[:, 1:])[:, None]
+    if clock.rhythm is not None:
+        index: FloatArray = np.arange(steps + 1, dtype=np.float64)
+        edges[clock.rows] = age[clock.rows, None] + clock.steps_s(start_s, step_s, np.zeros(1), index)[:, 0]
+        of_arrival = np.repeat(death_new, steps, axis=1)  # how long a step is depends on when
+        young = clock.steps_s(start_s, step_s, index[:-1] + 0.5, np.maximum(index - 0.5, 0.0))
+        ages = young[..., :-1].reshape(len(young), -1), young[..., 1:].reshape(len(young), -1)
+        of_arrival[clock.rows] = odds(priors, prior[clock.rows], *ages).reshape(len(young), steps, steps)
+        death_new = of_arrival
+    death_old = odds(priors, prior, edges[:, :-1], edges[:, 1:])
     renew(chains.first, route, moves, death_old, death_new, old, new, came)
-    came_s = start[chains.clique] + came * step_s
-    rest_and_leave = _between_frames(chains, frames, (priors, prior), (since, came_s), moves)
+    came_s = start_s + came * step_s
+    rest_and_leave = _between_frames(chains, frames, (priors, prior), (since, came_s), moves, clock)
     with np.errstate(divide="ignore"):
         return SiteChain(chains.first, frames.first, np.log(route), *rest_and_leave), new, came_s
+
+
+@dataclass(frozen=True, slots=True)
+class _SeatClock:
+    """By which clock the ages of seats are counted.
+
+    Attributes:
+        rhythm: of those that have another than the one on the wall; None for none.
+        hourly: (R,) whether a seat has it.
+        rows: (H,) seats that have.
+    """
+
+    rhythm: Rhythm | None
+    hourly: BoolArray
+    rows: IntArray
+
+    @classmethod
+    def of(cls, dynamics: SiteDynamics, chains: CliqueChains) -> _SeatClock:
+        n_sites, n_cliques = len(dynamics.since_s), len(dynamics.p_hop)
+        if dynamics.rhythm is None or dynamics.hourly is None or not dynamics.hourly.any():
+            return cls(None, np.zeros(n_sites + n_cliques, dtype=np.bool_), np.zeros(0, dtype=np.int64))
+        at_site = dynamics.hourly[chains.clique[chains.row_of_site]]
+        hourly = np.asarray(chains.by_row(at_site, np.zeros(n_cliques, dtype=np.bool_)))
+        return cls(dynamics.rhythm, hourly, np.flatnonzero(hourly))
+
+    def age_s(self, since_s: FloatArray, until_s: FloatArray, row: IntArray | None = None) -> FloatArray:
+        """Return ages (N,), at least 0, of seats (N,), all in order where None."""
+        age = until_s - since_s
+        if self.rhythm is not None:
+            hourly = self.hourly if row is None else self.hourly[row]
+            age = np.where(hourly, self.rhythm.elapsed_s(until_s) - self.rhythm.elapsed_s(since_s), age)
+        return np.asarray(np.maximum(age, 0.0))
+
+    def steps_s(self, start_s: FloatArray, step_s: FloatArray, begin: FloatArray, steps: FloatArray) -> FloatArray:
+        """Return what passes (H, B, M) on the clock of its seats in steps (M,) after the first `begin` (B,) ones."""
+        assert self.rhythm is not None
+        start, step = start_s[self.rows, None, None], step_s[self.rows, None, None]
+        until = self.rhythm.elapsed_s(start + step * (begin[:, None] + steps))
+        return np.asarray(until - self.rhythm.elapsed_s(start + step * begin[:, None]))
 
 
 def _between_frames(
@@ -485,6 +543,7 @@ def _between_frames(
     lifetimes: tuple[tuple[LifetimePrior, ...], IntArray],
     began_s: tuple[FloatArray, FloatArray],
     moves: FloatArray,
+    clock: _SeatClock,
 ) -> tuple[FloatArray, FloatArray]:
     """`log_rest` and `log_leave` of `SiteChain`.
 
@@ -494,6 +553,7 @@ def _between_frames(
         lifetimes: the different ones, and (R,) which of these each seat has.
         began_s: (R,) when the old ones came there, and (R,) when the new ones did.
         moves: (R,) probability that one that leaves a seat goes to another.
+        clock: by which their ages are counted.
     """
     priors, prior = lifetimes
     row = chains.first[frames.clique][:, None] + np.arange(chains.width)
@@ -506,7 +566,7 @@ def _between_frames(
         log_moves, log_stays = np.log(moves[row]), np.log1p(-moves[row])
     log_rest, log_leave = np.full((2, len(frames), 2, chains.width), -np.inf)
     for age, began in enumerate(began_s):
-        young, aged = np.maximum(start - began[row], 0.0), np.maximum(stop - began[row], 0.0)
+        young, aged = (clock.age_s(began[row], stamp_s, row) for stamp_s in (start, stop))
         log_odds = log_death_odds(priors, prior[row], young, aged)
         leave, rest = -np.logaddexp(0.0, -log_odds), -np.logaddexp(0.0, log_odds)
         log_rest[frame, age, seat] = np.logaddexp(rest, leave + log_stays)

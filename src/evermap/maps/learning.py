@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from evermap.config import LifetimeConfig
 from evermap.errors import ConfigError, suggestion
+from evermap.existence.hours import DatedStays, HourFit, learn_hours
 from evermap.existence.lifetimes import Lifetimes
 from evermap.maps.lives import DAY_S, EVERYWHERE, Life, Lives, general_purpose
 from evermap.maps.living import LivingMap, Stays
@@ -42,11 +43,13 @@ from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.survival.hazards import scale_hazard
 from evermap.survival.pooled_hazards import Statement, learn_hazards
 from evermap.survival.stay_likelihood import StayAges
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, rows_of
 
 USUAL = LifetimeConfig()
 BELIEVED = 2
 """Digits of the belief in an end that are learned from: less is no other evidence."""
+HOUR_ROUNDS = 2
+"""In which hours are learned from hazards by age, and these on the clock of the hours."""
 EM_STEPS = 30
 """Of which each at least halves the error of a share."""
 AGES_AT_ONCE = 50
@@ -182,7 +185,14 @@ class ClassLives:
     stay: tuple[HazardPosterior, ...]
 
     @classmethod
-    def of(cls, stays: Stays, before: Lives, now_s: float | None = None, settings: LifetimeConfig = USUAL) -> Self:
+    def of(
+        cls,
+        stays: Stays,
+        before: Lives,
+        now_s: float | None = None,
+        settings: LifetimeConfig = USUAL,
+        clock: Clock = Clock.RECORDING,
+    ) -> Self:
         """Learn lifetimes by class and place from all stays of a map until now.
 
         Args:
@@ -190,18 +200,21 @@ class ClassLives:
             before: what was learned after the session before; its chunks, looks and priors are kept.
             now_s: end of the newest session; None where `before` tells of it, too.
             settings: what is learned from, and how firmly.
+            clock: of all stamps; a recording's own has no hours of the week.
         """
         looks_s = before.looks_s if now_s is None else np.append(before.looks_s[before.looks_s < now_s], now_s)
         if not len(stays):
             nothing = learn_hazards(StayAges.empty(), [], general_purpose())
-            return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), tuple(nothing))
+            lives = _with_hours(replace(before, looks_s=looks_s), None, np.zeros(0, dtype=np.int64))
+            return cls(lives, np.zeros(0, dtype=np.int64), tuple(nothing))
         history = History(stays, looks_s, settings)
-        learned = _Learned(history, before)
+        learned = _Learned(history, before, clock)
+        before = _with_hours(before, learned.hours, history.class_ids)
         entries: list[tuple[int, tuple[int, int], Life]] = []
         for row, class_id in enumerate(history.class_ids.tolist()):
             life = learned.life(row)
             entries.append((class_id, (EVERYWHERE, EVERYWHERE), life))
-            own_lives = _of_chunks(history, row, life, before.chunk_m, settings)
+            own_lives = _of_chunks(history, row, life, before.chunk_m, settings, learned.hours)
             entries += [(class_id, chunk, own) for chunk, own in own_lives]
         if UNKNOWN not in history.class_ids:
             said, of_all = before.prior_of(UNKNOWN), learned.life(-1)
@@ -238,9 +251,10 @@ class _Learned:
         of_absences: (C, M, A) log likelihoods of absences.
         p_hop, p_known: (C + 1,) as of `Life`.
         n_stays, n_ended: (C + 1,) recent stays, and those of them that ended.
+        hours: what the stays say of the hours of the week; None where they cannot say anything.
     """
 
-    def __init__(self, history: History, before: Lives) -> None:
+    def __init__(self, history: History, before: Lives, clock: Clock = Clock.RECORDING) -> None:
         stays, n_classes = history.stays, len(history.class_ids)
         said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
         away = np.flatnonzero(history.recent & history.away)
@@ -259,11 +273,28 @@ class _Learned:
         self.p_hop = history.shares(history.hopped, np.isfinite(stays.gone_s))
         self.seen = self.sightings(history)
         statements = [Statement(life.stay, life.n_stays) if life else None for life in said]
-        ages = stay_ages(history, self.seen)
-        self.stay = tuple(learn_hazards(ages, statements, general_purpose()))
+        self.stay = tuple(learn_hazards(stay_ages(history, self.seen), statements, general_purpose()))
+        self.hours: HourFit | None = None
+        if clock is not Clock.RECORDING:
+            self.learn_by_hour(history, statements)
         self.p_known = history.share_known()
         self.n_stays = history.counts(history.recent).astype(np.int64)
         self.n_ended = history.counts(history.recent & np.isfinite(stays.gone_s)).astype(np.int64)
+
+    def learn_by_hour(self, history: History, statements: Sequence[Statement | None]) -> None:
+        """Learn hours of the week, and hazards by age on their clock, in turn."""
+        dated = date_stays(history, self.seen)
+        if not dated.may_show_hours():
+            return
+        stated = np.array([one is not None for one in statements])
+        for _ in range(HOUR_ROUNDS):
+            found = learn_hours(dated, [one.prior() for one in self.stay[:-1]], stated, self.hours)
+            if found.rhythm is None and self.hours is not None:
+                return  # what is left of it by ages on its own clock is no evidence against it
+            self.hours = found
+            if found.rhythm is None:
+                return
+            self.stay = tuple(learn_hazards(stay_ages(history, self.seen, found), statements, general_purpose()))
 
     def sightings(self, history: History) -> Sightings:
         """Return the recent stays, with how fast what a look missed is back: who is back before nobody can miss."""
@@ -340,25 +371,52 @@ def stays_by_class(history: History, seen: Sightings, settings: LifetimeConfig) 
     return _by_class(log_likelihood, history.kind[history.recent], len(history.class_ids))
 
 
-def stay_ages(history: History, seen: Sightings) -> StayAges:
-    """Return the recent stays by their ages; an end that is believed in part is one, and none, in proportion.
+def date_stays(history: History, seen: Sightings) -> DatedStays:
+    """Return the recent stays by their stamps, with instants of arrival between two looks."""
+    came = np.isfinite(seen.elsewhere_s)
+    since_s = np.where(came, seen.elsewhere_s, seen.first_s)
+    begin_s = since_s[:, None] + INSTANTS * (seen.first_s - since_s)[:, None]
+    gone_s = np.where(np.isfinite(seen.gone_s), seen.gone_s, np.maximum(history.looks_s[-1], seen.last_s))
+    p_gone = np.round(history.stays.p_gone[history.recent], BELIEVED)
+    kind = history.kind[history.recent]
+    return DatedStays(begin_s, seen.first_s, seen.last_s, gone_s, p_gone, np.ones(len(kind)), kind)
+
+
+def stay_ages(history: History, seen: Sightings, hours: HourFit | None = None) -> StayAges:
+    """Return the recent stays by their ages, on the clock of the hours of the week where there is one; an end that is
+    believed in part is one, and none, in proportion.
 
     What was there at the first look is as old as it was seen: forecasts ask for no other age of it. What was missed and
     is not told to be gone has gone in part, too, at any time until now: who learns of those alone that were seen again
     takes all for lasting.
     """
-    came = np.isfinite(seen.elsewhere_s)
-    since_s = np.where(came, seen.elsewhere_s, seen.first_s)
-    begin_s = since_s[:, None] + INSTANTS * (seen.first_s - since_s)[:, None]
-    gone_s = np.where(np.isfinite(seen.gone_s), seen.gone_s, np.maximum(history.looks_s[-1], seen.last_s))
-    first, last, gone = (stamp_s[:, None] - begin_s for stamp_s in (seen.first_s, seen.last_s, gone_s))
-    kind, p_gone = history.kind[history.recent], np.round(history.stays.p_gone[history.recent], BELIEVED)
+    dated, gap_s = date_stays(history, seen), seen.gap_s
+    stamps_s = dated.begin_s, dated.first_s, dated.last_s, dated.gone_s
+    if hours is not None:
+        counted = tuple(hours.count_s(dated.group, stamp_s) for stamp_s in stamps_s)
+        with np.errstate(invalid="ignore", divide="ignore"):  # as many gaps as there were
+            ratio = (counted[2] - counted[1]) / (dated.last_s - dated.first_s)
+        gap_s = gap_s * np.where(np.isfinite(ratio) & (ratio > 0.0), ratio, 1.0)[:, None]
+        stamps_s = counted[0], counted[1], counted[2], counted[3]
+    begin_s = stamps_s[0]
+    first, last, gone = (stamp_s[:, None] - begin_s for stamp_s in stamps_s[1:])
     never = np.full_like(gone, np.inf)
     both = [
-        StayAges(first, last, gone, p_gone, kind, seen.gap_s, seen.back_by_stay, seen.back_rate),
-        StayAges(first, last, never, 1.0 - p_gone, kind, seen.gap_s, seen.back_by_stay, seen.back_rate),
+        StayAges(first, last, gone, dated.p_gone, dated.group, gap_s, seen.back_by_stay, seen.back_rate),
+        StayAges(first, last, never, 1.0 - dated.p_gone, dated.group, gap_s, seen.back_by_stay, seen.back_rate),
     ]
     return StayAges.concatenate(both)
+
+
+def _with_hours(lives: Lives, hours: HourFit | None, class_ids: IntArray) -> Lives:
+    """Return lifetimes with what was learned of the hours of the week."""
+    known = np.zeros(0) if hours is None else np.array([hours.n_dated, hours.log_evidence])
+    if hours is None or hours.rhythm is None:
+        none = np.zeros(0)
+        return replace(lives, log_factor=none, hourly_class_id=none.astype(np.int64), hours_known=known)
+    unseen = [] if lives.prior_of(UNKNOWN) is not None or UNKNOWN in class_ids else [UNKNOWN]
+    follow = np.union1d(class_ids[hours.follows], np.array(unseen, dtype=np.int64))
+    return replace(lives, log_factor=hours.rhythm.log_factor, hourly_class_id=follow, hours_known=known)
 
 
 def absence_ages(
@@ -411,7 +469,7 @@ def lifetimes_by_class(living: LivingMap) -> dict[str, Lifetimes]:
 
 
 def _of_chunks(
-    history: History, row: int, life: Life, chunk_m: float, settings: LifetimeConfig
+    history: History, row: int, life: Life, chunk_m: float, settings: LifetimeConfig, hours: HourFit | None
 ) -> list[tuple[tuple[int, int], Life]]:
     """Return lifetimes of chunks in which stays of a class end sooner or later than elsewhere, as far as supported.
 
@@ -430,7 +488,10 @@ def _of_chunks(
     ended = np.isfinite(stays.gone_s)
     came_s = np.where(np.isfinite(stays.elsewhere_s), 0.5 * (stays.elsewhere_s + stays.first_s), stays.first_s)
     left_s = np.where(ended, 0.5 * (stays.last_s + stays.gone_s), stays.last_s)
-    expected = -life.stay.log_conditional_survival(stays.first_s - came_s, left_s - came_s)
+    first_s, kind = stays.first_s, np.full(len(stays), row)
+    if hours is not None:
+        came_s, first_s, left_s = (hours.count_s(kind, stamp_s) for stamp_s in (came_s, first_s, left_s))
+    expected = -life.stay.log_conditional_survival(first_s - came_s, left_s - came_s)
     n_ended = np.bincount(which.ravel(), ended * stays.p_gone)
     n_expected = np.bincount(which.ravel(), expected)
     n_expected *= max(n_ended.sum(), 1.0) / n_expected.sum()  # ends that nobody saw are missing everywhere

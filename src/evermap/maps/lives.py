@@ -1,4 +1,4 @@
-"""Lifetimes of stays and absences, and sites of returns, by class and place."""
+"""Lifetimes of stays and absences, and sites of returns, by class and place; and the hours of the week."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from evermap.existence.hours import LEAST_ENDS
+from evermap.existence.rhythm import Rhythm
 from evermap.survival.base import LifetimePrior
 from evermap.survival.families import GeneralPurpose
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 
 DAY_S = 86_400.0
 
@@ -61,6 +63,11 @@ class Lives:
         prior_class_id: (R,) classes of which a user said how long they stay; `UNKNOWN` for all that have no own entry.
         prior: (R,) what he said; `n_stays` is the number of stays that it is worth. `with_priors` of
             `maps.learning` makes them.
+        log_factor: (1008,) common factor on hazards of stays (`Rhythm`), by whose clock the ages of `hourly_class_id`
+            are counted; (0,) where ages are those on the wall.
+        hourly_class_id: (H,) classes that follow it; `UNKNOWN` for all that were never seen.
+        hours_known: ends of a known hour of the day that the looks are worth, and log evidence for a common factor
+            against none [nats]; (0,) where nobody could ask.
     """
 
     class_id: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -70,6 +77,27 @@ class Lives:
     looks_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     prior_class_id: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     prior: tuple[Life, ...] = ()
+    log_factor: FloatArray = field(default_factory=lambda: np.zeros(0))
+    hourly_class_id: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    hours_known: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def rhythm(self) -> Rhythm | None:
+        """Return the common factor; None where there is none."""
+        return Rhythm(self.log_factor) if len(self.log_factor) else None
+
+    def follows(self, class_id: IntArray) -> BoolArray:
+        """Return (N,) whether ages of the stays of classes (N,) are counted by the clock of the common factor."""
+        known = np.isin(class_id, self.class_id) | np.isin(class_id, self.prior_class_id)
+        unseen = ~known & (UNKNOWN in self.hourly_class_id)
+        return np.asarray(np.isin(class_id, self.hourly_class_id) | unseen)
+
+    def ages_s(self, class_id: IntArray, since_s: FloatArray, until_s: FloatArray) -> FloatArray:
+        """Return the ages (N,) of stays of classes (N,), or of one class (1,), by the clock that counts them."""
+        age, rhythm = until_s - since_s, self.rhythm
+        if rhythm is None:
+            return age
+        return np.where(self.follows(class_id), rhythm.elapsed_s(until_s) - rhythm.elapsed_s(since_s), age)
 
     def of(self, class_id: int, position_m: FloatArray | None = None) -> Life:
         """Return the life of a class (or `UNKNOWN`), at a position (2,), in space (3,), or on the whole floor: learned,
@@ -100,6 +128,33 @@ class Lives:
     def _learned(self, class_id: int, chunk: IntArray) -> Life | None:
         found = np.flatnonzero((self.class_id == class_id) & np.all(self.chunk == chunk, axis=1))
         return self.life[int(found[0])] if len(found) else None
+
+
+DAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
+
+
+def describe_hours(lives: Lives, clock: Clock, class_id: int | None = None) -> list[str]:
+    """Return a line on what is known of the hours of the week at which stays end, of a class or of all; none where
+    nobody could ask.
+    """
+    if not len(lives.hours_known):
+        return []
+    n_dated, nats = lives.hours_known.tolist()
+    open_text = f"at which hour of the day stays end is open: looks are worth {n_dated:.1f} ends of a known hour"
+    if not len(lives.log_factor):
+        none = f"stays end at all hours of the week alike (evidence for a rhythm {nats:.1f} nats)"
+        return [none if n_dated >= LEAST_ENDS else open_text]
+    if class_id is not None and not lives.follows(np.array([class_id]))[0]:
+        return ["stays of its class do not follow the hours of the week that others follow"]
+    factor = np.exp(lives.log_factor).reshape(len(DAYS) * 24, -1).mean(axis=1)
+    zone = " UTC" if clock is Clock.UNIX else ""
+    most, least = (
+        f"{DAYS[at // 24]} {at % 24:02d}:00{zone} ({factor[at]:.2g})"
+        for at in (int(factor.argmax()), int(factor.argmin()))
+    )
+    line = f"stays end by the hours of the week, most often on {most}, least often on {least} times the mean rate"
+    line += f" (evidence {nats:.1f} nats)"
+    return [line] if n_dated >= LEAST_ENDS else [line, open_text]
 
 
 EVERYWHERE = np.iinfo(np.int64).min

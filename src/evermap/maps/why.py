@@ -11,6 +11,7 @@ import numpy as np
 from evermap.errors import InputError, similar
 from evermap.existence.sites import Evidence
 from evermap.maps.diff import edits, renames, story_of
+from evermap.maps.lives import describe_hours
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import LOOKS, read_looks
@@ -260,7 +261,10 @@ def _on_time(answer: Answer, living: LivingMap, last_s: float) -> list[str]:
     life = living.lives.of(int(living.members.class_id[row[0]]), living.places.position_m[place[0]])
     at = answer.stays[answer.stays.first_s <= last_s]
     age_s = last_s - float(at.first_s[-1]) if len(at) else 0.0
-    stay = float(np.exp(life.stay.log_conditional_survival(age_s, age_s + waited_s)))
+    kind, seen_s = living.members.class_id[row[:1]], np.array([last_s])
+    counted_s = float(living.lives.ages_s(kind, seen_s - age_s, seen_s)[0]) if living.lives.rhythm else age_s
+    passed_s = float(living.lives.ages_s(kind, seen_s, np.array([living.stamp_s]))[0])
+    stay = float(np.exp(life.stay.log_conditional_survival(counted_s, counted_s + passed_s)))
     known = f"learned from {life.n_stays} stays" if life.n_stays else "nothing was learned for its class yet"
     like = f"of its class, {stay:.0%} of those that have stayed for {duration_text(age_s)}"
     return [f"{like} stay for another {duration_text(waited_s)} ({known})"]
@@ -286,7 +290,8 @@ def _on_learning(answer: Answer, living: LivingMap) -> list[str]:
     said = lives.prior_of(class_id)
     if said is not None:
         taught.append(f"what a user stated, which is worth {said.n_stays} stays")
-    return [f"how long it stays is known from {'; '.join(taught)}"] if taught else []
+    lines = [f"how long it stays is known from {'; '.join(taught)}"] if taught else []
+    return [*lines, *describe_hours(lives, living.clock, class_id)] if life.n_stays else lines
 
 
 def _looks(seen: Evidence) -> str:

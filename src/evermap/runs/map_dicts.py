@@ -154,6 +154,23 @@ def life_dicts(living: LivingMap) -> list[dict[str, Any]]:
     ]
 
 
+def hours_dict(living: LivingMap) -> dict[str, Any]:
+    """Return what is known of the hours of the week at which stays end, under `hours`; {} where nobody could ask.
+
+    `factor` has the factor on hazards for each of the 168 hours from Monday 00:00 on, of the classes in `classes`; None
+    where stays end at all hours alike, or looks do not show it.
+    """
+    import numpy as np
+
+    lives = living.lives
+    if not len(lives.hours_known):
+        return {}
+    n_dated, nats = lives.hours_known.tolist()
+    factor = np.exp(lives.log_factor).reshape(168, -1).mean(axis=1).round(4).tolist() if lives.rhythm else None
+    classes = labels_of(lives.hourly_class_id, living.class_names)
+    return {"hours": {"ends_dated": n_dated, "evidence_nats": json_number(nats), "factor": factor, "classes": classes}}
+
+
 def answer_dict(answer: Answer) -> dict[str, Any]:
     """Return everything behind a 'why', with every look."""
     seen, stays = answer.evidence, answer.stays

@@ -340,7 +340,8 @@ def lifetimes(request: Request, site: Site, _: Reader, revision: AtRevision = No
 
     def told(store: SqlStore) -> dict[str, Any]:
         living = server_of(request).sites.living(store, revision)[1]
-        return {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
+        known = {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
+        return known | map_dicts.hours_dict(living)
 
     return _told(request, site, told)
 

@@ -74,6 +74,8 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
         away_since_s=seen,
         p_hop=np.array([life.p_hop for life in of_clique]) * float(config.returns),
         return_share=share,
+        rhythm=living.lives.rhythm if config.learn_lifetimes else None,
+        hourly=living.lives.follows(class_id),
     )
 
 

@@ -246,8 +246,9 @@ class _Session:
         gone = np.flatnonzero(self.missed & (self.p_away >= EXISTS))  # others are not told to have vanished
         if longest is not None and len(gone):
             np.maximum.at(newest_s, row, sites.seen_s)
-            age_s = np.maximum(now.until_s - newest_s[gone], 0.0)
-            p_stays = longest.longest(class_of(entered, self.cliques[gone]), age_s, settings.credible)
+            class_id = class_of(entered, self.cliques[gone])
+            age_s = np.maximum(longest.lives.ages_s(class_id, newest_s[gone], np.asarray(now.until_s)), 0.0)
+            p_stays = longest.longest(class_id, age_s, settings.credible)
             p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
             self.least[gone] = np.maximum(self.least[gone], np.log(p_stays / (1.0 - p_stays)))
         self.newest = {clique: k for k, clique in enumerate(stays.clique_id.tolist())}

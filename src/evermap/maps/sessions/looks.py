@@ -396,8 +396,9 @@ def arrivals(
         enough = stamp_s[looked_then]
         hidden = np.where(along_clear >= settings.least_expected, p_hidden, p_hidden_unknown)[looked_then]
         p_missed = hidden + (1.0 - hidden) * np.exp(log_missed[looked_then] / settings.sticky)
-        stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
-        p_after = came_after(np.exp(stay.log_survival(until_s - enough)), p_missed, settings.lasting * hidden.min())
+        stay, kind = after.lives.of(int(kinds[row[site]]), middle[site]).stay, kinds[[row[site]]]
+        passed_s = after.lives.ages_s(kind, enough, np.asarray(until_s))
+        p_after = came_after(np.exp(stay.log_survival(passed_s)), p_missed, settings.lasting * hidden.min())
         at = int(np.flatnonzero(p_after >= settings.sure).max(initial=0))
         looked[k], p_appeared[k] = enough[at], p_after[at]
     return Arrivals(new, looked, p_appeared)

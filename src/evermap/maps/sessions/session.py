@@ -621,11 +621,11 @@ def lives_after(living: LivingMap, config: LivingConfig) -> ClassLives | None:
     """Return what a map teaches of lifetimes after a session; None if nothing is to be learned."""
     if not config.learn_lifetimes:
         return None
-    return ClassLives.of(living.stays, living.lives, living.stamp_s, config.lifetimes)
+    return ClassLives.of(living.stays, living.lives, living.stamp_s, config.lifetimes, living.clock)
 
 
 def lives_of(living: LivingMap, config: LivingConfig) -> ClassLives | None:
     """Return the lifetimes from the history of a map; None if nothing is learned or given."""
     if not (config.learn_lifetimes and len(living.stays) and len(living.lives.looks_s)):
         return None
-    return ClassLives.of(living.stays, living.lives, None, config.lifetimes)
+    return ClassLives.of(living.stays, living.lives, None, config.lifetimes, living.clock)

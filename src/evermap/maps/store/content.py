@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import EvermapError, InputError
+from evermap.existence.rhythm import BINS
 from evermap.geometry.chunked import ChunkedCovariance, Part, blocks
 from evermap.maps import shelves
 from evermap.maps.lives import Life
@@ -61,7 +62,8 @@ _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s
           "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m", "metres.robot_id",
           "metres.log_metre", "metres.log_variance", "metres.information", "traits.landmark_id",
           "traits.column_id", "traits.value", "traits.sessions", "renamed.landmark_id", "renamed.name",
-          "glimpses.position_m", "glimpses.stamp_s")  # fmt: skip
+          "glimpses.position_m", "glimpses.stamp_s", "lives.log_factor", "lives.hourly_class_id",
+          "lives.hours_known")  # fmt: skip
 """Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -362,6 +364,7 @@ _TABLES = (
 )  # fmt: skip
 _LEAST = {
     "members.class_id": UNKNOWN, "stays.class_id": UNKNOWN, "lives.class_id": UNKNOWN, "lives.prior_class_id": UNKNOWN,
+    "lives.hourly_class_id": UNKNOWN,
     "members.clique_id": 0, "sites.clique_id": 0, "stays.clique_id": 0, "sites.site_id": 0, "stays.site_id": 0,
     "places.n_hits": 0, "places.n_misses": 0, "traits.sessions": 1,
 }  # fmt: skip
@@ -376,9 +379,9 @@ _FINITE = (
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
     "boxes.size_m", "traits.value", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
     "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance", "glimpses.position_m",
-    "glimpses.stamp_s",
+    "glimpses.stamp_s", "lives.log_factor",
 )  # fmt: skip
-_NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "stamp_s", "session_start_s")
+_NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "lives.hours_known", "stamp_s", "session_start_s")
 _PROBABILITIES = ("sites.p_here", "sites.p_kept", "stays.p_gone")
 _COUNTS = ("sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown", "views.frames")
 
@@ -405,6 +408,8 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
         yield "columns of different lengths in 'renamed'"
     if len(living.lives.prior_class_id) != len(living.lives.prior):
         yield "columns of different lengths in 'lives'"
+    if len(living.lives.log_factor) not in (0, BINS) or len(living.lives.hours_known) not in (0, 2):
+        yield "hours of the week of another length in 'lives'"
     lines, places = living.sightlines, len(living.places)
     if len(lines.hidden) != len(lines.rules.p_hidden) or len(lines.shown) != len(lines.rules.p_hidden):
         yield "'sightlines.hidden' of another length"
