@@ -158,6 +158,44 @@ def test_pooled_hazards_tell_where_nothing_was_at_risk(tmp_path: Path) -> None:
     assert sum(high > 0.01 for _, _, high in curve) > 40
 
 
+def write_nights(path: Path, began: bool) -> None:
+    """Carts that leave at night only, pallets that leave at any hour, looked at six times a day for four weeks."""
+    rng, day, start = np.random.default_rng(1), 86400.0, 1_693_440_000.0  # a Thursday, 00:00
+    grid = np.arange(0.0, 56 * day, 60.0)
+    look_s = np.sort(rng.uniform(0.0, 28 * day, 168))
+    rows = []
+    for name, n in (("cart", 200), ("pallet", 120)):
+        phase = grid % day
+        night = np.where((phase < 6 * 3600.0) | (phase >= 20 * 3600.0), 2.4, 0.0)
+        counted = np.cumsum(60.0 * night) if name == "cart" else grid
+        came = rng.uniform(0.0, 25 * day, n)
+        left = grid[np.searchsorted(counted, np.interp(came, grid, counted) + rng.exponential(2 * day, n))]
+        first, after = np.searchsorted(look_s, came), np.searchsorted(look_s, left)
+        for at, seen, gone in zip(came.tolist(), first.tolist(), after.tolist(), strict=True):
+            if seen < gone:
+                right = f"{look_s[gone] - at:.1f}" if gone < len(look_s) else ""
+                when = f",{start + at:.1f}" if began else ""
+                rows.append(f"{look_s[gone - 1] - at:.1f},{right},{look_s[seen] - at:.1f},{name}{when}")
+    path.write_text("\n".join(["left,right,entry,class_id" + (",began" if began else ""), *rows]) + "\n")
+
+
+def test_pooled_hazards_tell_the_hours_at_which_things_leave(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    write_nights(path, began=False)
+    plain = numbers(path, "--estimator", "pooled", "--by", "class")["groups"]
+    assert all("hours" not in group for group in plain)
+    write_nights(path, began=True)
+    cart, pallet = numbers(path, "--estimator", "pooled", "--by", "class")["groups"]
+    factor = np.array(cart["hours"]["factor"]).reshape(7, 24).mean(axis=0)
+    assert factor[8:18].max() < 0.15
+    assert factor[[21, 22, 23, 0, 1, 2, 3, 4]].min() > 1.2
+    assert cart["half_gone_s"] == pytest.approx(2 * 86400.0 * np.log(2.0), rel=0.2)
+    assert pallet["hours"]["factor"] is None
+    assert pallet["hours"]["evidence_nats"] == cart["hours"]["evidence_nats"] > 20.0
+    assert "do not follow the hours" in run(path, "--estimator", "pooled", "--by", "class").stdout
+    assert "00 UTC (" in run(path, "--estimator", "pooled", "--by", "class").stdout.replace("\n", " ")
+
+
 def test_help_lists_every_estimator() -> None:
     shown = run("--help").stdout.partition("Estimators:")[2].partition("Every result")[0]
     listed = {word.rstrip(",") for line in shown.splitlines() for word in line.split()}

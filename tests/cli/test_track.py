@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 from evermap.cli.main import app
 from evermap.runs import examples
 from evermap.runs.track.lifetimes import read_lifetimes
+from evermap.types import Clock
 
 HOUR_S = 3600.0
 
@@ -147,6 +148,24 @@ def test_same_table_same_files(yard: Path, tmp_path: Path) -> None:
     ):
         assert (tmp_path / "again" / name).read_bytes() == (yard / "out" / name).read_bytes()
     assert json.loads(result.stdout)["counts"] == summary(yard)["counts"]
+
+
+def test_lifetimes_have_dates_where_detections_have(yard: Path, tmp_path: Path) -> None:
+    """The same four days as dates: the same lifetimes, with the instants from which their ages are counted."""
+    head, *lines = (line for line in (yard / "detections.csv").read_text().splitlines() if not line.startswith("#"))
+    start = np.datetime64("2026-03-02T00:00:00.000")
+    cells = [line.split(",", 1) for line in lines]
+    dated = [f"{start + np.timedelta64(round(1e3 * float(stamp)), 'ms')}Z,{rest}" for stamp, rest in cells]
+    (tmp_path / "detections.csv").write_text("\n".join([head, *dated]) + "\n")
+    result = run("track", tmp_path / "detections.csv", "--range-m", "12", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    found, plain = (read_lifetimes(folder / "out" / "lifetimes.csv") for folder in (tmp_path, yard))
+    assert plain.began_s is None
+    assert found.clock is Clock.UNIX
+    assert found.began_s is not None
+    np.testing.assert_allclose(found.data.left_s, plain.data.left_s, atol=2e-3)
+    last_s = rows(tmp_path / "out" / "spells.csv")["last_s"]
+    assert np.abs((found.began_s + found.data.left_s)[:, None] - last_s).min(axis=1).max() < 2e-3
 
 
 def test_survival_fit_takes_the_lifetimes(yard: Path) -> None:

@@ -298,6 +298,8 @@ def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) 
     ]
     if "loglik" in found.numbers:
         lines.append(("log likelihood", f"{found.numbers['loglik']:.6g}"))
+    if "hours" in found.numbers:
+        lines.append(("hours of the week", found.numbers["hours"]["line"]))
     if len(found.text) < 80:
         lines.append(("prior", found.text))
     return [*lines, *lifetime_lines(lifetime_numbers(found.prior))]

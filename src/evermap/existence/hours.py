@@ -34,6 +34,7 @@ from evermap.existence.rhythm import (
     weigh_penalties,
 )
 from evermap.survival.base import LifetimePrior
+from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 HOUR_S = 3600.0
@@ -105,6 +106,36 @@ class HourFit:
             return stamp_s
         follows = self.follows[group].reshape(-1, *(1,) * (np.ndim(stamp_s) - 1))
         return np.where(follows, self.rhythm.elapsed_s(stamp_s), stamp_s)
+
+
+Posteriors = Sequence[HazardPosterior]
+ROUNDS = 2
+"""In which hours are learned from hazards by age, and these on the clock of the hours."""
+
+
+def learn_hours_and_hazards(
+    stays: DatedStays, by_age: Posteriors, stated: BoolArray, learn: Callable[[HourFit], Posteriors]
+) -> tuple[HourFit | None, Posteriors]:
+    """Learn hours of the week, and hazards by age on their clock, in turn.
+
+    Args:
+        stays: of C classes.
+        by_age: C hazards, or more, by age on the wall.
+        stated: (C,) as `learn_hours` takes it.
+        learn: returns hazards by age on the clock of a rhythm.
+
+    Returns:
+        what is known of the hours, None where nobody can ask; and hazards, `by_age` itself without a rhythm.
+    """
+    if not stays.may_show_hours():
+        return None, by_age
+    fit, hazards = None, by_age
+    for _ in range(ROUNDS):
+        found = learn_hours(stays, [one.prior() for one in hazards[: len(stated)]], stated, fit)
+        if found.rhythm is None:  # what is left of it by ages on its own clock is no evidence against it
+            return fit or found, hazards
+        fit, hazards = found, learn(found)
+    return fit, hazards
 
 
 def learn_hours(

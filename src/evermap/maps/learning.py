@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from evermap.config import LifetimeConfig
 from evermap.errors import ConfigError, suggestion
-from evermap.existence.hours import DatedStays, HourFit, learn_hours
+from evermap.existence.hours import DatedStays, HourFit, learn_hours_and_hazards
 from evermap.existence.lifetimes import Lifetimes
 from evermap.maps.lives import DAY_S, EVERYWHERE, Life, Lives, general_purpose
 from evermap.maps.living import LivingMap, Stays
@@ -48,8 +48,6 @@ from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, rows_
 USUAL = LifetimeConfig()
 BELIEVED = 2
 """Digits of the belief in an end that are learned from: less is no other evidence."""
-HOUR_ROUNDS = 2
-"""In which hours are learned from hazards by age, and these on the clock of the hours."""
 EM_STEPS = 30
 """Of which each at least halves the error of a share."""
 AGES_AT_ONCE = 50
@@ -273,28 +271,18 @@ class _Learned:
         self.p_hop = history.shares(history.hopped, np.isfinite(stays.gone_s))
         self.seen = self.sightings(history)
         statements = [Statement(life.stay, life.n_stays) if life else None for life in said]
-        self.stay = tuple(learn_hazards(stay_ages(history, self.seen), statements, general_purpose()))
-        self.hours: HourFit | None = None
+
+        def learn(hours: HourFit | None = None) -> list[HazardPosterior]:
+            return learn_hazards(stay_ages(history, self.seen, hours), statements, general_purpose())
+
+        found: tuple[HourFit | None, Sequence[HazardPosterior]] = None, learn()
         if clock is not Clock.RECORDING:
-            self.learn_by_hour(history, statements)
+            stated = np.array([one is not None for one in statements])
+            found = learn_hours_and_hazards(date_stays(history, self.seen), found[1], stated, learn)
+        self.hours, self.stay = found[0], tuple(found[1])
         self.p_known = history.share_known()
         self.n_stays = history.counts(history.recent).astype(np.int64)
         self.n_ended = history.counts(history.recent & np.isfinite(stays.gone_s)).astype(np.int64)
-
-    def learn_by_hour(self, history: History, statements: Sequence[Statement | None]) -> None:
-        """Learn hours of the week, and hazards by age on their clock, in turn."""
-        dated = date_stays(history, self.seen)
-        if not dated.may_show_hours():
-            return
-        stated = np.array([one is not None for one in statements])
-        for _ in range(HOUR_ROUNDS):
-            found = learn_hours(dated, [one.prior() for one in self.stay[:-1]], stated, self.hours)
-            if found.rhythm is None and self.hours is not None:
-                return  # what is left of it by ages on its own clock is no evidence against it
-            self.hours = found
-            if found.rhythm is None:
-                return
-            self.stay = tuple(learn_hazards(stay_ages(history, self.seen, found), statements, general_purpose()))
 
     def sightings(self, history: History) -> Sightings:
         """Return the recent stays, with how fast what a look missed is back: who is back before nobody can miss."""

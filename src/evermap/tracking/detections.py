@@ -21,7 +21,7 @@ from evermap.io.spatial import COVARIANCE
 from evermap.io.table import ENDINGS
 from evermap.io.text import quote
 from evermap.tracking.frame import DetectionTable, Poses, box_table, boxes_of, in_world
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, is_in_space, rows_of
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, is_in_space, rows_of
 from evermap.valid import QUATERNION, STAMP_S, X_M, Y_M, Z_M, Quantity
 
 POSITION = tuple(replace(axis, optional=True) for axis in (X_M, Y_M, Z_M))
@@ -92,6 +92,7 @@ def read_detections(source: TableSource, *, min_score: float | None = None) -> D
         score=table.numbers(SCORE)[rows] if SCORE.name in table else None,
         n_weak=int((kept & ~strong).sum()),
         warnings=tuple(warnings),
+        clock=table.clock() or Clock.RECORDING,
     )
 
 

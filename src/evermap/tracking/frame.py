@@ -10,7 +10,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.types import UNKNOWN, FloatArray, IntArray, SpatialRecording
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, SpatialRecording
 from evermap.valid import STAMP_S
 
 
@@ -172,6 +172,7 @@ class DetectionTable:
         source: file it came from, '' if none.
         n_weak: detections left out because of their score.
         warnings: remarks of the reader.
+        clock: of the stamps; a recording's own unless they are dates.
     """
 
     stamp_s: FloatArray
@@ -189,6 +190,7 @@ class DetectionTable:
     sensor_yaw_rad: FloatArray | None = None
     n_weak: int = 0
     warnings: tuple[str, ...] = ()
+    clock: Clock = Clock.RECORDING
 
     @property
     def n_frames(self) -> int:
@@ -262,6 +264,7 @@ def box_table(recording: SpatialRecording, range_scale: float = 1.0) -> Detectio
         box=np.column_stack([given.size_m[rows], heading_of(local)]),
         score=given.score[rows] if np.isfinite(given.score[rows]).any() else None,
         warnings=(),
+        clock=recording.clock,
     )
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from evermap.runs.track.lifetimes import LifetimeTable, groups_of, lifetimes_csv, parse_by, read_lifetimes
 from evermap.survival.censored import CensoredLifetimes
-from evermap.types import UNKNOWN
+from evermap.types import UNKNOWN, Clock
 
 seconds = st.floats(0.0, 1e9)
 places = st.floats(-1e6, 1e6)
@@ -36,7 +36,13 @@ def test_what_is_written_is_read(table: LifetimeTable, tmp_path_factory: pytest.
     names = (*table.class_names, "")
     which = np.where(table.class_of_row == UNKNOWN, 3, table.class_of_row)
     path.write_bytes(lifetimes_csv(table.data, names, which, table.position_m))
-    again = read_lifetimes(path)
+    assert read_lifetimes(path).began_s is None
+    began_s = 1e9 + np.arange(len(table)) / 8.0
+    for clock in (Clock.UNIX, Clock.LOCAL_WALL):
+        path.write_bytes(lifetimes_csv(table.data, names, which, table.position_m, began_s, clock))
+        again = read_lifetimes(path)
+        np.testing.assert_array_equal(again.began_s, began_s)
+        assert again.clock is clock
     for name in CensoredLifetimes.__slots__:
         np.testing.assert_array_equal(getattr(again.data, name), getattr(table.data, name))
     np.testing.assert_array_equal(again.position_m, table.position_m)

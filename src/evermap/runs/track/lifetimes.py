@@ -17,10 +17,11 @@ from evermap.io.columns import Columns, csv_bytes, named, read_columns
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.text import prior_text
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, json_number
-from evermap.valid import X_M, Y_M, Quantity
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, json_number
+from evermap.valid import LATEST_S, X_M, Y_M, Quantity
 
 if TYPE_CHECKING:
+    from evermap.existence.hours import DatedStays, HourFit
     from evermap.survival.hazard_posterior import HazardPosterior
     from evermap.survival.hazard_regression import HazardDraws
     from evermap.survival.nonparametric import KaplanMeier, Npmle
@@ -35,6 +36,7 @@ RIGHT = Quantity(
 )
 ENTRY = Quantity("entry", 0.0, _LATEST_S, optional=True, hint="seconds; empty or 0 where nothing is truncated")
 WEIGHT = Quantity("weight", 0.0, 1e15, optional=True, hint="how many lifetimes the row stands for; 1 where empty")
+BEGAN = Quantity("began", -LATEST_S, LATEST_S, optional=True, hint="a date, or seconds since 1970", dates=True)
 _REQUIRED = ("left", "right")
 _OPTIONAL = ("entry", "weight", "class_id", "x_m", "y_m")
 LIFETIME_COLUMNS = (*_REQUIRED, *_OPTIONAL)
@@ -55,6 +57,8 @@ class LifetimeTable:
         source: file it came from, '' if none.
         line: (N,) line of each row in that file.
         warnings: remarks of the reader.
+        began_s: (N,) when each began, in seconds since 1970; nan where the table does not say.
+        clock: of these; that on the wall where they are dates without a zone.
     """
 
     data: CensoredLifetimes
@@ -66,6 +70,8 @@ class LifetimeTable:
     source: str
     line: IntArray
     warnings: tuple[str, ...] = ()
+    began_s: FloatArray | None = None
+    clock: Clock = Clock.UNIX
 
     def __len__(self) -> int:
         return len(self.line)
@@ -94,14 +100,15 @@ class LifetimeGroup:
 
 
 def read_lifetimes(path: str | Path) -> LifetimeTable:
-    """Return a CSV (also gzipped) or Parquet table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`.
+    """Return a CSV (also gzipped) or Parquet table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`
+    and `began`.
 
     Raises:
         InputError: anything wrong in the file, by line and column.
     """
     warnings: list[str] = []
     table = read_columns(path, warnings)
-    table.expect(_REQUIRED, _OPTIONAL)
+    table.expect(_REQUIRED, (*_OPTIONAL, BEGAN.name))
     if len(table) == 0:
         raise InputError("has no rows below its header", path=path, hint="one row per lifetime")
     left = table.numbers(LEFT)
@@ -130,15 +137,22 @@ def read_lifetimes(path: str | Path) -> LifetimeTable:
         source=str(path),
         line=table.line,
         warnings=tuple(warnings),
+        began_s=table.numbers(BEGAN) if BEGAN.name in table else None,
+        clock=(BEGAN.name in table and table.clock(BEGAN.name)) or Clock.UNIX,
     )
 
 
 def lifetimes_csv(
-    data: CensoredLifetimes, class_names: Sequence[str], class_of_row: IntArray, xy_m: FloatArray
+    data: CensoredLifetimes,
+    class_names: Sequence[str],
+    class_of_row: IntArray,
+    xy_m: FloatArray,
+    began_s: FloatArray | None = None,
+    clock: Clock = Clock.UNIX,
 ) -> bytes:
     """Return a table that `read_lifetimes` reads, of N lifetimes, their classes (N,) and places on the ground (N, 2).
 
-    Columns `entry` and `weight` are written where they say something.
+    Columns `entry` and `weight` are written where they say something, `began` where it is known (N,): dates on a clock.
     """
     right = np.where(np.isinf(data.right_s), np.nan, data.right_s)
     columns = {"left": data.left_s, "right": right}
@@ -147,6 +161,10 @@ def lifetimes_csv(
     if (data.weight != 1.0).any():
         columns["weight"] = data.weight
     columns |= {"class_id": named(class_names, class_of_row), "x_m": xy_m[:, 0], "y_m": xy_m[:, 1]}
+    if began_s is not None:
+        zone = "Z" if clock is Clock.UNIX else ""
+        dates = np.datetime_as_string(np.rint(1e3 * began_s).astype("datetime64[ms]"))
+        columns["began"] = named([f"{date}{zone}" for date in dates], np.arange(len(dates)))
     return csv_bytes(columns)
 
 
@@ -361,7 +379,8 @@ def _gaussian_process(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> 
 
 
 def _fit_pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
-    """Hazards by age of which groups have a part in common."""
+    """Hazards by age of which groups have a part in common, and hours of the week where rows say when they began."""
+    from evermap.existence.hours import learn_hours_and_hazards
     from evermap.maps.lives import general_purpose
     from evermap.survival.pooled_hazards import learn_hazards
     from evermap.survival.stay_likelihood import StayAges
@@ -369,8 +388,17 @@ def _fit_pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterat
     group = np.zeros(len(table), dtype=np.int64)
     for number, one in enumerate(groups):
         group[one.rows] = number
-    found = learn_hazards(StayAges.of_samples(table.data, group), [None] * len(groups), general_purpose())
-    for posterior in found[:-1]:
+
+    def learn(hours: HourFit | None = None) -> list[HazardPosterior]:
+        data = table.data if hours is None or table.began_s is None else _count(table.data, table.began_s, group, hours)
+        return learn_hazards(StayAges.of_samples(data, group), [None] * len(groups), general_purpose())
+
+    hours: HourFit | None = None
+    found: Sequence[HazardPosterior] = learn()
+    if table.began_s is not None and np.isfinite(table.began_s).all():
+        dated, stated = _date(table.data, table.began_s, group), np.zeros(len(groups), dtype=np.bool_)
+        hours, found = learn_hours_and_hazards(dated, found, stated, learn)
+    for number, posterior in enumerate(found[:-1]):
         expected, lower, upper = posterior.survival(posterior.edges_s)
         seen_s = posterior.seen_s
         numbers = {
@@ -380,8 +408,47 @@ def _fit_pooled(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterat
             "upper_95": upper.tolist(),
             "seen_from_s": json_number(seen_s[0]),
             "seen_to_s": json_number(seen_s[1]),
+            **({} if hours is None else {"hours": _describe_hours(hours, number, table.clock)}),
         }
         yield _with_prior(POOLED, posterior, posterior.prior(), numbers)
+
+
+def _date(data: CensoredLifetimes, began_s: FloatArray, group: IntArray) -> DatedStays:
+    """Return lifetimes (N,) by their stamps; an end that was observed lies within a second."""
+    from evermap.existence.hours import DatedStays
+
+    gone_s = began_s + np.where(data.exact, data.right_s + 1.0, data.right_s)
+    first_s, last_s = began_s + data.entry_s, began_s + np.maximum(data.left_s, data.entry_s)
+    return DatedStays(began_s[:, None], first_s, last_s, gone_s, np.ones(len(group)), data.weight, group)
+
+
+def _count(data: CensoredLifetimes, began_s: FloatArray, group: IntArray, hours: HourFit) -> CensoredLifetimes:
+    """Return lifetimes on the clock of the hours of the week."""
+    begin = hours.count_s(group, began_s)
+    left, right, entry = (
+        hours.count_s(group, began_s + age) - begin for age in (data.left_s, data.right_s, data.entry_s)
+    )
+    return CensoredLifetimes(left, np.maximum(right, 1e-3), np.minimum(entry, 0.999 * right), data.weight)
+
+
+def _describe_hours(hours: HourFit, group: int, clock: Clock) -> dict[str, Any]:
+    """Return what is known of the hours of the week of a group, for JSON, with a line for people."""
+    from evermap.maps.lives import Lives, describe_hours
+
+    factor = np.zeros(0) if hours.rhythm is None else hours.rhythm.log_factor
+    follow = np.flatnonzero(hours.follows)
+    lives = Lives(
+        log_factor=factor, hourly_class_id=follow, hours_known=np.array([hours.n_dated, hours.log_evidence]),
+        class_id=np.arange(len(hours.follows)),
+    )  # fmt: skip
+    by_hour = np.exp(factor).reshape(168, -1).mean(axis=1).round(4).tolist() if hours.follows[group] else None
+    line = "; ".join(describe_hours(lives, clock, group))
+    return {
+        "ends_dated": hours.n_dated,
+        "evidence_nats": json_number(hours.log_evidence),
+        "factor": by_hour,
+        "line": line,
+    }
 
 
 def _with_prior(name: str, fitted: Fitted, prior: LifetimePrior, numbers: dict[str, Any]) -> LifetimeEstimate:

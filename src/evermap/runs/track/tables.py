@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.existence.rhythm import DAY_S
 from evermap.io.arrow import parquet_bytes
 from evermap.io.columns import csv_bytes, named
 from evermap.io.spatial import COVARIANCE, upper_triangle
@@ -15,7 +16,7 @@ from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
 from evermap.tracking.record import BOX_COLUMNS
 from evermap.tracking.run import TrackResult
 from evermap.tracking.tracklets import TrackState
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray
 
 _Columns = Mapping[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]
 """By name; columns of names hold the names and their indices."""
@@ -105,9 +106,12 @@ def _lifetimes_csv(result: TrackResult) -> bytes:
         return (",".join(LIFETIME_COLUMNS) + "\n").encode()
     spell = result.spell_of_lifetime
     spells = result.spells
-    return lifetimes_csv(
-        result.lifetimes, result.table.class_names, spells.class_id[spell], spells.position_m[spell, :2]
-    )
+    began_s = None
+    if result.table.clock is not Clock.RECORDING and np.ptp([*spells.first_s, *spells.last_s]) > DAY_S:
+        began_s = spells.last_s[spell] - result.lifetimes.left_s
+    xy_m = spells.position_m[spell, :2]
+    names, clock = result.table.class_names, result.table.clock
+    return lifetimes_csv(result.lifetimes, names, spells.class_id[spell], xy_m, began_s, clock)
 
 
 def _axes(prefix: str, unit: str, vectors: FloatArray) -> dict[str, FloatArray]:
