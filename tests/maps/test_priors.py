@@ -24,9 +24,11 @@ from evermap.maps.living import LivingMap, Stays
 from evermap.maps.store.content import Chunk, pack, unpack
 from evermap.survival import (
     Exponential,
+    LifetimePrior,
     LogNormal,
     Mixture,
     PiecewiseConstantHazard,
+    Uniform,
     Weibull,
     gone_daily,
     never_leaves,
@@ -119,6 +121,36 @@ def test_what_was_stated_keeps_its_form_when_stays_are_seen() -> None:
     survival = np.exp(found.log_survival(np.array([1.0, 1.9, 3.0]) * DAY_S))
     np.testing.assert_allclose(survival[:2], 1.0, atol=1e-12)
     assert survival[2] < 0.01
+
+
+def test_what_is_stated_never_to_leave_and_left_may_leave() -> None:
+    """Twenty of which a user said so are gone after some ten days: the forecast is that of the band, not for ever."""
+    living = with_priors(LivingMap(), told(cart=ENDLESS), ["cart"], worth=5)
+    lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
+    found = ClassLives.of(stays_of(0, np.linspace(5.0, 15.0, 20).tolist()), lives, 100.0 * DAY_S + 60.0)
+    ages_s = np.array([1.0, 5.0, 10.0, 20.0]) * DAY_S
+    mean, _, upper = found.band(0, ages_s)
+    forecast = np.exp(found.lives.of(0).stay.log_survival(ages_s))
+    np.testing.assert_allclose(forecast, mean, atol=0.02)
+    assert forecast[0] == pytest.approx(1.0, abs=1e-6)  # none was seen to leave so young
+    assert upper[-1] < 0.6
+    steps = with_priors(LivingMap(), told(cart=STATED["steps"]), ["cart"], worth=5).lives
+    early = ClassLives.of(stays_of(0, [1.0] * 20), replace(steps, looks_s=lives.looks_s), 100.0 * DAY_S + 60.0)
+    ages_s = np.array([0.5, 1.5, 1.9]) * DAY_S
+    np.testing.assert_allclose(np.exp(early.lives.of(0).stay.log_survival(ages_s)), early.band(0, ages_s)[0], atol=0.02)
+    assert early.band(0, ages_s)[0][1] < 0.5
+
+
+@pytest.mark.parametrize("prior", [ENDLESS, Uniform(DAY_S)], ids=["never", "a day at most"])
+def test_places_of_what_is_not_expected_to_end_have_no_rates_of_their_own(prior: LifetimePrior) -> None:
+    """In two squares of the floor: no end is expected in either, or ends long ago; nothing is divided by that."""
+    stays = stays_of(UNKNOWN, [5.0] * 12, gone=False)
+    stays = replace(stays, position_m=np.where(np.arange(12)[:, None] % 2, [[50.0, 0.0]], [[0.0, 0.0]]))
+    living = with_priors(LivingMap(), told(**{"": prior}), [], worth=20)
+    lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
+    with np.errstate(divide="raise", invalid="raise"):
+        found = ClassLives.of(stays, lives, 100.0 * DAY_S).lives
+    assert len(found.life) == 1
 
 
 def test_more_worth_holds_a_prior_longer() -> None:

@@ -482,6 +482,8 @@ def _of_chunks(
     expected = -life.stay.log_conditional_survival(first_s - came_s, left_s - came_s)
     n_ended = np.bincount(which.ravel(), ended * stays.p_gone)
     n_expected = np.bincount(which.ravel(), expected)
+    if not 0.0 < n_expected.sum() < np.inf:  # what never leaves, or is not there any more, has no rates to compare
+        return []
     n_expected *= max(n_ended.sum(), 1.0) / n_expected.sum()  # ends that nobody saw are missing everywhere
     firm = np.array(settings.firmness)[:, None]
     log_weight = np.sum(

@@ -13,6 +13,9 @@ from evermap.survival.hazards import PiecewiseConstantHazard, scale_hazard
 from evermap.survival.logmath import TINY, log_sum_exp
 from evermap.types import FloatArray
 
+CERTAIN = 800.0
+"""Integrated hazard that nothing survives."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HazardPosterior(SurvivalEstimate):
@@ -67,7 +70,9 @@ class HazardPosterior(SurvivalEstimate):
         return mean, lower, upper
 
     def prior(self) -> LifetimePrior:
-        """Return the lifetime whose survival is the expected one at every edge; what was stated keeps its form."""
+        """Return the lifetime whose survival is the expected one at every edge; what was stated keeps its form, unless
+        ends were seen at ages at which nothing was stated to end.
+        """
         integrated = integrate_expected(self.rates, self.weight, self.edges_s)
         ends_s = np.append(self.edges_s[1:], 2.0 * self.edges_s[-1])
         if self.said is None:
@@ -75,6 +80,10 @@ class HazardPosterior(SurvivalEstimate):
         said = 0.0 - np.asarray(self.said.log_conditional_survival(self.edges_s, ends_s))
         known = (said > 0.0) & np.isfinite(said) & (integrated > 0.0)
         factors = np.where(known, integrated / np.where(known, said, 1.0), 1.0) * np.exp(self.before)
+        impossible = (said == 0.0) & (integrated > 0.0)
+        if impossible.any():
+            hazards = np.where(impossible, integrated, np.where(np.isfinite(said), said, CERTAIN) * factors)
+            return PiecewiseConstantHazard(tuple(self.edges_s), tuple(hazards / (ends_s - self.edges_s)))
         if np.abs(factors - 1.0).max() < 1e-10:
             return self.said
         return scale_hazard(self.said, tuple(self.edges_s.tolist()), tuple(factors.tolist()))
