@@ -169,7 +169,7 @@ def write_nights(path: Path, began: bool) -> None:
         night = np.where((phase < 6 * 3600.0) | (phase >= 20 * 3600.0), 2.4, 0.0)
         counted = np.cumsum(60.0 * night) if name == "cart" else grid
         came = rng.uniform(0.0, 25 * day, n)
-        left = grid[np.searchsorted(counted, np.interp(came, grid, counted) + rng.exponential(2 * day, n))]
+        left = grid[np.searchsorted(counted, np.interp(came, grid, counted) + rng.exponential(0.5 * day, n))]
         first, after = np.searchsorted(look_s, came), np.searchsorted(look_s, left)
         for at, seen, gone in zip(came.tolist(), first.tolist(), after.tolist(), strict=True):
             if seen < gone:
@@ -188,8 +188,9 @@ def test_pooled_hazards_tell_the_hours_at_which_things_leave(tmp_path: Path) -> 
     cart, pallet = numbers(path, "--estimator", "pooled", "--by", "class")["groups"]
     factor = np.array(cart["hours"]["factor"]).reshape(7, 24).mean(axis=0)
     assert factor[8:18].max() < 0.15
-    assert factor[[21, 22, 23, 0, 1, 2, 3, 4]].min() > 1.2
-    assert cart["half_gone_s"] == pytest.approx(2 * 86400.0 * np.log(2.0), rel=0.2)
+    assert factor[[21, 22, 23, 0, 1, 2, 3, 4]].min() > 1.0
+    half_s = 0.5 * 86400.0 * np.log(2.0)
+    assert cart["half_gone_s"] == pytest.approx(half_s, rel=0.06)  # by age on the wall a quarter more
     assert pallet["hours"]["factor"] is None
     assert pallet["hours"]["evidence_nats"] == cart["hours"]["evidence_nats"] > 20.0
     assert "do not follow the hours" in run(path, "--estimator", "pooled", "--by", "class").stdout

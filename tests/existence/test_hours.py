@@ -7,12 +7,21 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from evermap.existence.hours import HOUR_S, HOURS, DatedStays, HourFit, HourLikelihood, learn_hours
+from evermap.existence.hours import (
+    HOUR_S,
+    HOURS,
+    DatedStays,
+    HourFit,
+    HourLikelihood,
+    learn_hours,
+    learn_hours_and_hazards,
+)
 from evermap.existence.rhythm import BIN_S, BINS, DAY_S, MONDAY_S, WEEK_S, Rhythm
 from evermap.existence.sites import SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import general_purpose
 from evermap.sensing.sightlines import Lines
 from evermap.survival import Exponential, LifetimePrior, Weibull
+from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.survival.pooled_hazards import learn_hazards
 from evermap.survival.stay_likelihood import StayAges
 from evermap.types import FloatArray
@@ -216,6 +225,66 @@ def test_likelihood_is_that_of_stays_on_the_clock() -> None:
     first, last, gone = (rhythm.elapsed_s(at) for at in (stays.first_s, stays.last_s, stays.gone_s))
     left, right = np.exp(-(last - first) / MEAN_S), np.exp(-(gone - first) / MEAN_S)
     np.testing.assert_allclose(likelihood.values(log_factor), np.log(left - right), rtol=1e-9)
+
+
+def test_curvature_is_that_of_the_likelihood() -> None:
+    """Against differences of the values, and of the gradient."""
+    likelihood = HourLikelihood.of(make_stays("work", 3, 60), [Exponential(1.0 / MEAN_S)], None)
+    at, rng = np.random.default_rng(0).normal(0.0, 0.7, HOURS), np.random.default_rng(1)
+    slope, information = likelihood.curvature(at)
+    for _ in range(5):
+        to = 1e-4 * rng.normal(size=HOURS)
+        above, below = (float(likelihood.values(at + sign * to).sum()) for sign in (1.0, -1.0))
+        assert 0.5 * (above - below) == pytest.approx(slope @ to, rel=1e-5)
+        change = likelihood.curvature(at + to)[0] - likelihood.curvature(at - to)[0]
+        np.testing.assert_allclose(-0.5 * change, information @ to, atol=1e-8)
+
+
+def test_hours_and_hazards_are_learned_in_turn() -> None:
+    """Hazards are those on the clock that is kept, which is the one of most evidence; and by age where none is."""
+    asked: list[tuple[HourFit, list[HazardPosterior]]] = []
+
+    def learn_from(stays: DatedStays) -> tuple[HourFit | None, object, object]:
+        def learn(fit: HourFit) -> list[HazardPosterior]:
+            asked.append((fit, learn_hazards(count_ages(stays, fit), [None], general_purpose())))
+            return asked[-1][1]
+
+        asked.clear()
+        by_age = learn_hazards(count_ages(stays), [None], general_purpose())
+        return *learn_hours_and_hazards(stays, by_age, np.array([False]), learn), by_age
+
+    fit, hazards, _ = learn_from(make_stays("night", 4))
+    assert len(asked) == 2
+    assert fit is not None
+    assert [found is hazards for asked_fit, found in asked if asked_fit.rhythm is fit.rhythm] == [True]
+    assert fit.log_evidence == pytest.approx(asked[0][0].log_evidence, rel=0.2)
+    fit, hazards, by_age = learn_from(make_stays("none", 4))
+    assert not asked
+    assert hazards is by_age
+    assert fit is not None
+    assert fit.rhythm is None
+
+
+def test_ages_that_are_known_to_the_hour_on_the_wall_are_kept() -> None:
+    """Cars of a shift come at half past eight and leave eight hours later: hours of ends are told by ages."""
+    rng, look_s = np.random.default_rng(2), START_S + np.arange(0.25, 24.0 * 7 * WEEKS, 0.5) * HOUR_S
+    began = START_S + (rng.choice([d for d in range(7 * WEEKS - 1) if d % 7 < 5], 300) * 24.0 + 8.5) * HOUR_S
+    began += 0.3 * HOUR_S * rng.normal(size=300)
+    end = began + 8.0 * HOUR_S * np.exp(0.05 * rng.normal(size=300))
+    first, after = np.searchsorted(look_s, began), np.searchsorted(look_s, end)
+    ones = np.ones(300)
+    stays = DatedStays(
+        began[:, None], look_s[first], look_s[after - 1], look_s[after], ones, ones, np.zeros(300, dtype=np.int64)
+    )
+
+    def learn(fit: HourFit | None = None) -> list[HazardPosterior]:
+        return learn_hazards(count_ages(stays, fit), [None], general_purpose())
+
+    by_age = learn()
+    fit, hazards = learn_hours_and_hazards(stays, by_age, np.array([False]), learn)
+    assert fit is not None
+    assert fit.rhythm is None
+    assert hazards is by_age
 
 
 def test_long_stays_are_counted_over_all_hours() -> None:

@@ -35,6 +35,7 @@ from evermap.existence.rhythm import (
 )
 from evermap.survival.base import LifetimePrior
 from evermap.survival.hazard_posterior import HazardPosterior
+from evermap.survival.logmath import log_sum_exp
 from evermap.types import BoolArray, FloatArray, IntArray
 
 HOUR_S = 3600.0
@@ -48,6 +49,8 @@ LEAST_NATS = 3.0
 """Log evidence for a rhythm against none from which there is one."""
 MOST_AGAINST = 2.0
 """Nats against the common rhythm from which a class does not follow it; of a class with a stated lifetime, for it."""
+LEAST = -700.0
+"""Log likelihood of an end that a lifetime does not know."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-6
 
 
@@ -93,12 +96,14 @@ class HourFit:
         follows: (C,) classes that have it.
         n_dated: number of ends of known hour that the looks are worth.
         log_evidence: of the rhythm against none, in nats, before it is asked whether that is enough.
+        cost: by how much the log evidence is less than the gain in likelihood, in nats (Occam's factor).
     """
 
     rhythm: Rhythm | None
     follows: BoolArray
     n_dated: float
     log_evidence: float
+    cost: float = 0.0
 
     def count_s(self, group: IntArray, stamp_s: FloatArray) -> FloatArray:
         """Return stamps (N, ...) on the clock by which ages of classes (N,) are counted."""
@@ -129,13 +134,40 @@ def learn_hours_and_hazards(
     """
     if not stays.may_show_hours():
         return None, by_age
-    fit, hazards = None, by_age
+    lifetimes, fit = [one.prior() for one in by_age[: len(stated)]], None
+    plain = _log_likelihood(stays, lifetimes, None)
+    best, kept = None, by_age
     for _ in range(ROUNDS):
-        found = learn_hours(stays, [one.prior() for one in hazards[: len(stated)]], stated, fit)
+        found = learn_hours(stays, lifetimes, stated, fit)
         if found.rhythm is None:  # what is left of it by ages on its own clock is no evidence against it
-            return fit or found, hazards
+            best = best or found
+            break
         fit, hazards = found, learn(found)
-    return fit, hazards
+        lifetimes = [one.prior() for one in hazards[: len(stated)]]
+        gain = _log_likelihood(stays, lifetimes, fit) - plain - fit.cost
+        if best is None or gain > best.log_evidence:
+            best, kept = replace(fit, log_evidence=gain), hazards
+    if best is not None and best.rhythm is not None and best.log_evidence < LEAST_NATS:
+        return replace(best, rhythm=None, follows=np.zeros_like(stated)), by_age
+    return best, kept
+
+
+def _log_likelihood(stays: DatedStays, lifetimes: Sequence[LifetimePrior], fit: HourFit | None) -> float:
+    """Return the log likelihood of stays whose ages are counted by a clock, given that they lasted until first seen."""
+    stamps_s = stays.begin_s, stays.first_s, stays.last_s, stays.gone_s
+    begin, first, last, gone = stamps_s if fit is None else (fit.count_s(stays.group, at) for at in stamps_s)
+    gone = np.where(np.isfinite(gone), gone, last)
+    total = 0.0
+    for kind, lifetime in enumerate(lifetimes):
+        mine = stays.group == kind
+        came, seen, until = (np.maximum(at[mine, None] - begin[mine], 0.0) for at in (first, last, gone))
+        there = np.asarray(lifetime.log_survival(came))
+        lasted = there + lifetime.log_conditional_survival(came, seen)
+        ended = lasted + lifetime.log_conditional_death(seen, until)
+        on, off = (log_sum_exp(np.maximum(part, LEAST)) - log_sum_exp(there) for part in (lasted, ended))
+        p_gone = stays.p_gone[mine] * np.isfinite(stays.gone_s[mine])
+        total += float(stays.weight[mine] @ (p_gone * off + (1.0 - p_gone) * on))
+    return total
 
 
 def learn_hours(
@@ -157,7 +189,8 @@ def learn_hours(
         follows, log_factor, log_evidence = _find_followers(likelihood, start, stated)
         if log_evidence >= max(LEAST_NATS, best.log_evidence):
             rhythm = Rhythm(np.repeat(log_factor, round(HOUR_S / BIN_S)))
-            best = replace(best, rhythm=rhythm, follows=follows)
+            gain = float(likelihood.gains(log_factor, n)[follows].sum())
+            best = replace(best, rhythm=rhythm, follows=follows, cost=gain - log_evidence)
         best = replace(best, log_evidence=max(best.log_evidence, log_evidence))
     return best
 
@@ -246,6 +279,15 @@ class HourLikelihood:
         gone = np.log(-np.expm1(-np.where(self.weight > 0.0, spent, 1.0)))
         return np.asarray(self.weight * gone - self.seen @ factor)
 
+    def curvature(self, log_factor: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the gradient (168,) of the log likelihood, and its negative second derivative (168, 168)."""
+        factor, ended = np.exp(log_factor), self.weight > 0.0
+        each = self.ending[ended] * factor
+        odds = 1.0 / np.expm1(np.clip(each.sum(axis=1), 1e-300, 700.0))
+        pull = self.weight[ended] * odds
+        slope = pull @ each - self.seen.sum(axis=0) * factor
+        return slope, (each.T * (pull * (1.0 + odds))) @ each - np.diag(slope)
+
     def gains(self, log_factor: FloatArray, n_classes: int) -> FloatArray:
         """Return by how much (C,) the log likelihood of each class is larger with the factor than without."""
         each = self.values(log_factor) - self.values(np.zeros(HOURS))
@@ -293,16 +335,9 @@ class HourLikelihood:
             return float(found) if np.isfinite(found) else -np.inf
 
         def bend(beta: FloatArray) -> tuple[FloatArray, FloatArray]:
-            factor = np.exp(columns @ beta)
-            each = ending * factor
-            spent = np.maximum(each.sum(axis=1), 1e-300)
-            odds = 1.0 / np.expm1(np.minimum(spent, 700.0))
-            pull = (weight * odds) @ each
-            slope = columns.T @ (pull - during * factor + half) - penalty @ beta
-            moved = each @ columns
-            information = (moved.T * (weight * odds * (1.0 + odds))) @ moved
-            information += (columns.T * (during * factor - pull)) @ columns
-            return slope, _usable(information, penalty) + penalty
+            slope, information = self.curvature(columns @ beta)
+            pull = columns.T @ (slope + half) - penalty @ beta
+            return pull, _usable(columns.T @ information @ columns, penalty) + penalty
 
         best = goodness(beta)
         slope, hessian = bend(beta)
