@@ -265,6 +265,29 @@ def test_hours_and_hazards_are_learned_in_turn() -> None:
     assert fit.rhythm is None
 
 
+def test_the_round_of_most_evidence_is_kept() -> None:
+    """All leave after two days of nights: hours that are learned again from such ages take the place of these."""
+    stays = make_stays("night", 4, 300)
+    grid = START_S + np.arange(7 * 24 * 60 * WEEKS) * 60.0
+    spread = np.random.default_rng(54).normal(2.0 * DAY_S, 0.05 * DAY_S, len(stays.group))
+    left = true_clock("night", stays.begin_s.mean(axis=1)) + spread
+    end = np.append(grid, np.inf)[np.searchsorted(true_clock("night", grid), left)]
+    look_s = np.unique(np.concatenate([stays.first_s, stays.last_s, stays.gone_s[np.isfinite(stays.gone_s)]]))
+    after = np.searchsorted(look_s, end)
+    stays = replace(stays, last_s=look_s[after - 1], gone_s=np.append(look_s, np.inf)[after])
+    stays = DatedStays(*(getattr(stays, one.name)[stays.last_s > stays.first_s] for one in fields(DatedStays)))
+
+    def learn(fit: HourFit | None = None) -> list[HazardPosterior]:
+        return learn_hazards(count_ages(stays, fit), [None], general_purpose())
+
+    fit, hazards = learn_hours_and_hazards(stays, learn(), np.array([False]), learn)
+    assert fit is not None
+    assert fit.rhythm is not None
+    early, late = hazards[0].prior().quantile(np.array([0.1, 0.5]))
+    assert early > 1.5 * DAY_S
+    assert late == pytest.approx(2.0 * DAY_S, rel=0.05)
+
+
 def test_ages_that_are_known_to_the_hour_on_the_wall_are_kept() -> None:
     """Cars of a shift come at half past eight and leave eight hours later: hours of ends are told by ages."""
     rng, look_s = np.random.default_rng(2), START_S + np.arange(0.25, 24.0 * 7 * WEEKS, 0.5) * HOUR_S

@@ -212,7 +212,7 @@ def test_ends_of_a_chunk_are_expected_by_the_clock_of_its_class() -> None:
         here, whole = (lives.of(0, at).stay for at in (np.array([50.0, 0.0]), None))
         ratios.append(here.log_survival(DAY_S) / whole.log_survival(DAY_S))
     assert abs(ratios[0] - 1.0) > 0.08
-    assert ratios[1] == pytest.approx(1.0, abs=0.03)
+    assert ratios[1] == pytest.approx(1.0, abs=0.015)
 
 
 def test_landmarks_without_a_class_follow_by_their_own_stays() -> None:
