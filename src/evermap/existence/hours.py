@@ -10,8 +10,9 @@ both are the same where the hazard depends on one of the two alone, and over who
 `exp(g)` has the mean 1 over the week. Given the hazards by age, a stay that was seen over hours of integrated hazards
 `w_b`, and whose end lies within hours of `a_b`, has the log likelihood `-w r + log(1 - exp(-a r))`, `r = exp(g)`: that
 of what was seen, not of ends at imputed hours, which would support whatever they were imputed by. g is as smooth as the
-marginal likelihood wants it (`rhythm.find_smoothness`), and weighed against none by evidence (Laplace). Looks at one
-hour of the day show no hour of an end: `n_dated` is how many ends of a known hour they are worth.
+marginal likelihood wants it (`rhythm.find_smoothness`), and weighed against none by evidence (Laplace). Then hazards
+are learned by ages on its clock, and the clock is kept if stays are likelier by these, by more than the factor costs.
+Looks at one hour of the day show no hour of an end: `n_dated` is how many ends of a known hour they are worth.
 """
 
 from __future__ import annotations

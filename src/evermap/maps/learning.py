@@ -1,12 +1,13 @@
 """Learning of lifetimes from the history of a map, after every session (MATH.md sections 5, 6 and 9).
 
 Classes learn from each other, and what a user says of a class counts as a number of stays and keeps its form
-(`survival.pooled_hazards`); places lean on their class. Absences of which nothing was said have a constant hazard and a
-share that never returns (`survival.class_lifetimes`). `History` is what a map knows of the comings and goings of its
-cliques. What happened between two looks is not seen. The likelihood of lifetimes takes care of arrivals. Departures can
-be missed, too: a clique that leaves a site and is back at it by the next look has one long stay instead of two, like a
-door that was opened and closed again. With a rate `l` of leaving, and `n` of coming back to this very site, a clique
-that is there is there again at the next look, after `dt`, with probability
+(`survival.pooled_hazards`); places lean on their class. Where stamps are dates, ages of stays are counted by the hours
+of the week at which stays end, if they end at some rather than at others (`existence.hours`). Absences of which nothing
+was said have a constant hazard and a share that never returns (`survival.class_lifetimes`). `History` is what a map
+knows of the comings and goings of its cliques. What happened between two looks is not seen. The likelihood of lifetimes
+takes care of arrivals. Departures can be missed, too: a clique that leaves a site and is back at it by the next look
+has one long stay instead of two, like a door that was opened and closed again. With a rate `l` of leaving, and `n` of
+coming back to this very site, a clique that is there is there again at the next look, after `dt`, with probability
 
     P(dt) = (n + l exp(-(l + n) dt)) / (l + n)          instead of exp(-l dt)
 

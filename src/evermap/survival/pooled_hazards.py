@@ -7,7 +7,8 @@ a class has of its own, both Gaussian processes over log age: a slow one, which 
 fast one. Hazards are constant over stretches of age, so the likelihood of a stay is exact: entry, arrival between two
 looks, the end between two looks, or none (MATH.md sections 6 and 9). Scales and the share of the variance that classes
 have in common are on a grid, each weighed by its evidence, so nothing is searched that could fail to be found. Draws
-are normal about the most probable hazards (Laplace), with exact densities along axes, and weights for the rest.
+are normal about the most probable hazards (Laplace), with exact densities along axes, and weights for the rest. The
+hour of the week is in the clock by which ages are counted (`existence.hours`).
 
 **What is stated is worth w stays**: in every stretch it has seen `d_k = w P(T in k)` ends at the hazard that it states
 (a power prior, Ibrahim and Chen 2000), to which `v_c = 0` is most probable. The level of `b_c` is chosen such that the
