@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -11,11 +13,16 @@ import pytest
 from evermap import run_slam
 from evermap.config import Config
 from evermap.geometry import se3
+from evermap.io import read_recording
+from evermap.io.map_formats import read_map_file
 from evermap.metrics.summary import compare_with_truth
+from evermap.slam.correlation import Lasting
 from evermap.slam.space import moved_within
 from evermap.slam.space.against_map import MapComparison
 from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, has_moved
 from evermap.slam.space.intake import prepare_space
+from evermap.slam.space.marginal import _cost_of_outliers
+from evermap.slam.space.problem import SpatialNoise
 from evermap.slam.space.solve import solve_space
 from evermap.types import ChangeKind, Frames, SlamResult, SpatialRecording
 
@@ -164,6 +171,46 @@ def test_others_are_asked_where_none_of_the_likeliest_is_at_two_places(monkeypat
     assert asked == [[4, 1, 0, 2], [8, 6, 3, 5]]
     assert found.tolist() == asked[1]
     assert moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8]), 0.95) is None
+
+
+@pytest.mark.parametrize(
+    ("every_s", "places", "persist_s", "share", "count"),
+    [
+        (0.1, 1, 1.0, 0.0, 8.0),
+        (0.1, 1, 1.0, 0.85, 1.465),
+        (0.1, 1, 100.0, 1.0, 1.0),
+        (0.1, 8, 100.0, 1.0, 8.0),
+        (0.1, 2, 100.0, 1.0, 2.0),
+        (60.0, 1, 1.0, 1.0, 8.0),
+    ],
+)
+def test_outliers_in_a_row_of_one_place_have_one_reason(every_s, places, persist_s, share, count):
+    """Eight outliers, by turns of some places: how many that is. Else one view that errs for long is a move."""
+    world = tagged_corridor(3)
+    problem = solve_space(prepare_space(as_poses(world, 3), Config().slam.space), None).optimum.smoother.problem
+    rows = np.arange(8)
+    row = replace(
+        problem, stamp_s=every_s * np.arange(len(problem.stamp_s)), pose_row=np.arange(len(problem.pose_row)),
+        place=np.arange(len(problem.place)) % places,
+    )  # fmt: skip
+    odd = np.isin(np.arange(len(problem.place)), rows)
+    noise = SpatialNoise(1.0, 1.0)
+    lasting = Lasting(np.array([persist_s]), np.array([share]))
+    found = _cost_of_outliers(row, noise, odd, lasting)
+    assert found == pytest.approx(count * float(problem.sightings.log_odds[problem.kind[0]]), rel=0.01)
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_no_tag_of_a_real_room_moves_while_a_camera_passes(shared_data, tmp_path):
+    """STAR-loc, whose tags stand; two of its survey are exchanged. One view of three is 4 cm off, with outliers."""
+    folder = shared_data / "starloc"
+    command = [sys.executable, folder / "starloc_to_plain.py", folder, "loop-3d_s1", tmp_path / "drive"]
+    subprocess.run(command, check=True)
+    survey = read_map_file(folder / "mocap" / "environment_v1.csv").landmarks
+    told = run_slam(read_recording(tmp_path / "drive"), prior_map=survey).changes
+    assert [change.stamp_from_s for change in told if np.isfinite(change.stamp_from_s)] == []
+    assert {change.landmark_ids for change in told if change.probability > 0.9} == {(35,), (36,)}
 
 
 def test_what_is_at_one_place_in_the_end_did_not_move():

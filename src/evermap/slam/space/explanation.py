@@ -155,7 +155,7 @@ def _log_evidence(explanation: SpatialExplanation, begun: SpatialNoise, lasting:
     """
     optimum, identity = explanation.optimum, explanation.identity
     problem, seen = optimum.smoother.problem, _find_seen_places(explanation)
-    found = log_marginal_likelihood(optimum, begun, lasting, in_room=True)
+    found = log_marginal_likelihood(optimum, begun, lasting, of_places=True)
     if len(problem.prior.place):
         found += sum(log_map_density(problem, explanation.from_map, optimum.estimate.place))
     twice = np.count_nonzero(seen) - len(np.unique(identity[seen]))

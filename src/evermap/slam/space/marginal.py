@@ -7,7 +7,9 @@ approximation, poses, places and calibration integrated out; MATH.md, section 8)
     log p(z | levels) = -1/2 sum log |Sigma| - cost - 1/2 log |H|,
 
 says which is more probable. Errors of detections that last have a density of their own: each residual is whitened by
-those of the same landmark before it (Cholesky factor of their correlation), and counts in `H` as what is new in it.
+those of the same landmark before it (Cholesky factor of their correlation), and counts in `H` as what is new in it. A
+row of outliers is no more independent than a row of errors: each costs its share of the information, too. Else a
+landmark that stands seems to have moved wherever one view of it errs for long.
 """
 
 from __future__ import annotations
@@ -43,10 +45,12 @@ OUTLIER = 0.5
 """Inlier probability below which a factor is an outlier."""
 NUGGET = 1e-3
 """Share of the variance that is white at least."""
+INDEPENDENT = Lasting(np.ones(1), np.zeros(1))
+"""Errors that do not last."""
 
 
 def log_marginal_likelihood(
-    optimum: SpatialOptimum, begun: SpatialNoise, lasting: Lasting | None = None, *, in_room: bool = False
+    optimum: SpatialOptimum, begun: SpatialNoise, lasting: Lasting | None = None, *, of_places: bool = False
 ) -> float:
     """Return the log marginal likelihood of an optimum's noise levels, up to a constant of the measurements [nats].
 
@@ -57,19 +61,19 @@ def log_marginal_likelihood(
         optimum: values that are the optimum of their levels.
         begun: levels to compare outliers with, the same for all that are compared.
         lasting: how long errors of detections last; None: they are independent.
-        in_room: places of which no map says anything have a prior, so that solutions with other places compare.
+        of_places: whether solutions with other places are compared: places of which no map says anything have a prior
+            then, and of outliers of one place in a row only what is new counts.
     """
     smoother, noise = optimum.smoother, optimum.noise
     problem = smoother.problem
     now = smoother.linearised(optimum.estimate, noise, heavy=False)
     good = now.weight > OUTLIER
-    new, of_inliers = np.ones(len(good)), 0.5 * float((now.residual[good] ** 2).sum())
+    new, of_inliers, shape = np.ones(len(good)), 0.5 * float((now.residual[good] ** 2).sum()), INDEPENDENT
     if lasting is not None and lasting.any:
-        new, noise, of_inliers = _likeliest_lasting(problem, now.residual, good, noise, lasting)
+        shape, new, noise, of_inliers = _likeliest_lasting(problem, now.residual, good, noise, lasting)
     of_inliers += float(_log_sigmas(problem, noise)[good].sum())
     of_inliers -= 0.5 * float((ROWS[problem.kind] * np.log(new))[good].sum())
-    log_odds = problem.sightings.log_odds[problem.kind]
-    of_outliers = float((log_odds + _log_sigmas(problem, begun))[~good].sum())
+    of_outliers = _cost_of_outliers(problem, begun, ~good, shape if of_places else INDEPENDENT)
     driven = smoother.driven(now)[..., -1]
     kept = now.odometry_weight > OUTLIER
     of_odometry = 0.5 * float((driven[kept] ** 2).sum())
@@ -80,12 +84,18 @@ def log_marginal_likelihood(
     priors = _cost_of_priors(smoother, now)
     counted = SpatialSmoother(replace(problem, share=new), optimum.estimate.pose)
     linear = counted.linearised(optimum.estimate, noise, heavy=False)
-    graph, of_places = counted.graph(noise, heavy=False), 0.0
-    if in_room:
+    graph, of_room = counted.graph(noise, heavy=False), 0.0
+    if of_places:
         free = np.setdiff1d(np.arange(len(problem.oriented)), problem.prior.place)
-        graph, _, of_places = hold_in_room(graph, len(problem.stamp_s) + free)
+        graph, _, of_room = hold_in_room(graph, len(problem.stamp_s) + free)
     information = exhausted(graph.factorised(linear.now))
-    return float(of_places - of_inliers - of_outliers - of_odometry - priors - 0.5 * information.log_determinant)
+    return float(of_room - of_inliers - of_outliers - of_odometry - priors - 0.5 * information.log_determinant)
+
+
+def _cost_of_outliers(problem: SpatialProblem, begun: SpatialNoise, odd: BoolArray, lasting: Lasting) -> float:
+    """Return what outliers cost: of those of one place in a row only what is new, as they err for one reason."""
+    new = lasting.information(problem.stamp_s[problem.pose_row[odd]], problem.place[odd])
+    return float((new * problem.sightings.log_odds[problem.kind[odd]] + _log_sigmas(problem, begun)[odd]).sum())
 
 
 def _log_sigmas(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:
@@ -98,8 +108,8 @@ def _log_sigmas(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:
 
 def _likeliest_lasting(
     problem: SpatialProblem, residual: FloatArray, good: BoolArray, noise: SpatialNoise, lasting: Lasting
-) -> tuple[FloatArray, SpatialNoise, float]:
-    """Return what is new in each detection (M,), noise levels and half the sum of squares of the errors that last by
+) -> tuple[Lasting, FloatArray, SpatialNoise, float]:
+    """Return how long errors last, what is new in each detection (M,), noise levels and half the sum of squares, by
     which inliers are most probable.
 
     Each shape has its best levels in closed form; one of the times and all of those of the variogram are tried.
@@ -107,7 +117,7 @@ def _likeliest_lasting(
     shapes = [lasting]
     for persist_s in lasting.persist_s:
         shapes += [Lasting(np.array([persist_s]), np.array([share])) for share in SHARES]
-    best, found = -np.inf, (np.ones(len(good)), noise, 0.0)
+    best, found = -np.inf, (lasting, np.ones(len(good)), noise, 0.0)
     for shape in shapes:
         white, new = _whitened(problem, residual, good, shape)
         scale = _scales(problem, white, good)
@@ -119,7 +129,7 @@ def _likeliest_lasting(
             for level, kind, rows in _PARTS
         )
         if likelihood - half > best:
-            best, found = likelihood - half, (new, at, half)
+            best, found = likelihood - half, (shape, new, at, half)
     return found
 
 
