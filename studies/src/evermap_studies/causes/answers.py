@@ -58,6 +58,7 @@ ANSWERS = {
     "noise": Answer(SOUND, is_optional=True),
     "anything": Answer(REFUSED | OUTDATED, is_optional=True),
     "change": Answer(SOUND | OUTDATED, is_change=True),
+    "carried": _answer(MENDED, "carried-about", "carried"),
     "wrong identity": _answer(
         MENDED, "identity wrong-identity duplicate-identity duplicate double-identity rides-along", "identit"
     ),
