@@ -45,7 +45,7 @@ def _answer(verdicts: frozenset[VerdictKind], codes: str, words: str, states: st
 
 
 _SCALES = "length-unit odometer-scale odometry-scale range-scale scale forward-scale "
-_CLOCKS = "clock delay sensor-delay clock-drift clock-step "
+_CLOCKS = "clock delay sensor-delay clock-drift clock-step clock-jitter "
 _MOUNTS = "mount mount-axes mount-flip mount-angle mount-position sensor-mount "
 _LENSES = "lens focal focal-axes focal-length intrinsics distortion camera-lens calibration "
 _SITES = "map-site another-site other-site map-frame map "
