@@ -66,7 +66,7 @@ def measure_jitter(result: SlamResult, recording: AnyRecording) -> Jitter | None
     ]
     ends = [(view[end], name[end]) for end in (after, before)]
 
-    def alternate(values: list[FloatArray], factor: list[FloatArray]) -> FloatArray:
+    def multiply_opposite(values: list[FloatArray], factor: list[FloatArray]) -> FloatArray:
         most = CLIPPED * 1.4826 * float(np.median(np.abs(values[0])))
         one, two = (by * np.clip(each, -most, most) for each, by in zip(values, factor, strict=True))
         return -_multiply((one, *ends[0]), (two, *ends[1]))
@@ -75,8 +75,10 @@ def measure_jitter(result: SlamResult, recording: AnyRecording) -> Jitter | None
     told = passed > 0.0
     if np.count_nonzero(told) < FEWEST:
         return None
-    variance = max(float(alternate(along, fast)[told].sum() / passed[told].sum()), 0.0)
-    weighed = alternate([each * by for each, by in zip(along, fast, strict=True)], [np.ones(len(step))] * 2)[told]
+    variance = max(float(multiply_opposite(along, fast)[told].sum() / passed[told].sum()), 0.0)
+    weighed = multiply_opposite([each * by for each, by in zip(along, fast, strict=True)], [np.ones(len(step))] * 2)[
+        told
+    ]
     surely = float(weighed.sum() / max(math.sqrt(float((weighed**2).sum())), 1e-12))
     return Jitter(math.sqrt(variance), surely, surely / math.sqrt(len(weighed)))
 
