@@ -114,3 +114,18 @@ def test_a_little_jitter_beside_the_noise_of_detections_is_let_be() -> None:
     assert jitter.sigma_s > LEAST_S
     assert jitter.share < LEAST_SHARE
     assert not find_jitter(run_slam(wrong), wrong)
+
+
+def test_of_few_frames_jitter_is_not_certain() -> None:
+    """The same as of a whole drive, in the first seconds of it."""
+    wrong = stamp_on_arrival(make("plane"), 0.06)
+    result = run_slam(wrong)
+    early = result.innovations.stamp_s < result.innovations.stamp_s[0] + 6.0
+    few = replace(result, innovations=result.innovations[np.flatnonzero(early)])
+    whole, part = measure_jitter(result, wrong), measure_jitter(few, wrong)
+    assert whole is not None
+    assert part is not None
+    assert whole.surely > SURELY > part.surely
+    assert min(part.sigma_s / LEAST_S, part.share / LEAST_SHARE) > 1.0
+    assert find_jitter(result, wrong)
+    assert not find_jitter(few, wrong)
