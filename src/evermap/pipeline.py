@@ -14,6 +14,7 @@ from evermap.errors import ConfigError, DataError, InputError
 from evermap.types import AnyRecording, IntArray, Landmarks, Progress, Recording, SlamResult, is_in_space
 
 if TYPE_CHECKING:
+    from evermap.explain.causes import Inputs
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.placing import Localised
     from evermap.maps.sessions.planar import PlanarVisit
@@ -47,7 +48,9 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
+    from evermap.explain.carried import Carried, find_carried, name_carried
     from evermap.explain.causes import Inputs
+    from evermap.explain.faults import with_mended
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
@@ -55,7 +58,7 @@ def run_slam(
     from evermap.slam.moving_bodies import without_motion
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.up import with_known_up
-    from evermap.slam.votes import list_doubled_ids
+    from evermap.slam.votes import list_doubled_ids, without_identities
 
     config = config or Config()
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
@@ -78,23 +81,35 @@ def run_slam(
         remarks = (*remarks, *moved)
         if any(finding.code == NO_ODOMETRY for finding in found):  # all landmarks move: to ask which says nothing
             config = _without_changes(config)
-    given = Inputs.of(recording, prior_map)
+    if len(read.detections) != len(recording.detections):  # what rides along in the plane was left out
+        read = recording
 
-    def conclude(**more: Any) -> SlamResult:
+    def conclude(given: Inputs, read: AnyRecording, not_missed: list[int], **more: Any) -> SlamResult:
         visit, result, under = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
         result = replace(session.existing(visit, result, config.living), association=evidence)
         if prior_map is not None:
-            expected = prior_map[~np.isin(prior_map.landmark_id, doubled)]  # what was read was not missed
+            expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
             result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
         return _judge(
             result, under.recording, config, under.prior_map, found, doubled,
             as_read=read, session=session.solution_of(visit),
         )  # fmt: skip
 
-    result = conclude(realtime=realtime, progress=progress)
-    if result.causes or realtime or not config.slam.explain.on or not _is_held(result):
+    asked = Inputs.of(recording, prior_map), read, doubled.tolist()  # what was read was not missed
+    result, carried = conclude(*asked, realtime=realtime, progress=progress), tuple[Carried, ...]()
+    if realtime or not config.slam.explain.on:
         return result
-    return conclude(is_suspected=True)  # its scores cost too much to be asked before all else is sound
+    if config.slam.unknown_ids is not True and (suspects := find_carried(result, read)):
+        names = [one.landmark_id for one in suspects]
+        rest, read_rest = without_identities(recording, names), without_identities(read, names)
+        without = Inputs.of(rest, prior_map), read_rest, [*asked[2], *names]
+        other = conclude(*without)
+        confirmed = find_carried(other, read)  # along poses that they do not bend
+        if [one.landmark_id for one in confirmed] == names:
+            asked, result, carried = without, other, confirmed
+    if not result.causes and _is_held(result):
+        result = conclude(*asked, is_suspected=True)  # its scores cost too much to be asked before all else is sound
+    return with_mended(result, tuple(name_carried(one, read) for one in carried))
 
 
 def _without_changes(config: Config) -> Config:

@@ -1,5 +1,6 @@
 """What readings and one solution show to be wrong without a comparison: jumps and silences of the odometry, corners of
-tags that are listed clockwise, and identities on two landmarks; and whether the solution has put it right.
+tags that are listed clockwise, stamps that jitter, and identities on two landmarks; and whether the solution has put it
+right.
 
 The estimator bridges both by what is seen: a step that no robot drives is an outlier of the odometry, and within a gap
 it may go anywhere. Where the poses are as well known for all that, the cause is told, and nothing is wrong with the
@@ -14,6 +15,7 @@ from math import degrees, isnan, nan
 
 import numpy as np
 
+from evermap.explain.jitter import find_jitter
 from evermap.explain.symptoms import (
     PER_LANDMARK,
     USED,
@@ -74,7 +76,7 @@ def find_faults(
         prior_map: that was given, or what a living map expected; it tells in which order corners are.
         doubled: identities that were read at two places at once, and are not used.
     """
-    order = _order_of_corners(result, recording, prior_map)
+    order = (*_order_of_corners(result, recording, prior_map), *find_jitter(result, recording))
     names = [(recording.landmark_names.get(int(one), str(one)), nan) for one in doubled]
     riders = (_rider(finding) for finding in findings if finding.code == RIDER)
     mended = (*riders, *(_double(*each) for each in [*names, *find_doubles(result, recording)]))

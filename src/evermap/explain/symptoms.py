@@ -92,7 +92,8 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     """Return detections beside expectations, of those that have both, in the plane with the estimated calibration."""
     innovations, places = result.innovations, result.landmarks
     row, known = _rows_of(places, innovations.landmark_id)
-    taken_s = innovations.stamp_s - _find_delays_s(recording, result)
+    rows = np.minimum(innovations.detection, max(len(recording.detections) - 1, 0))
+    taken_s = innovations.stamp_s - _find_delays_s(recording, result)[rows]
     pose, near = find_poses_at(result.trajectory, taken_s)
     keep = np.flatnonzero(known & near & (innovations.detection < len(recording.detections)))
     detection, row, pose = innovations.detection[keep], row[keep], pose[keep]
@@ -106,31 +107,51 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
         range_m = np.linalg.norm(expected, axis=1)
         blind = without_range(recording)[detection]
         length = np.maximum(np.linalg.norm(read, axis=1), 1e-9)
-        point = np.where(blind[:, None], np.nan, se3.transform(mounts, read))
         read = np.where(blind[:, None], read * (range_m / length)[:, None], read)
     else:
         seen = recording.detections
         expected = _predict_readings(pose, places.position_m[row], recording, result.parameters)
-        range_m, bearing = expected[:, 0], seen.bearing_rad[detection]
-        known = np.isfinite(bearing) & ~(seen.sigma_bearing_rad[detection] >= ANY_BEARING_RAD)
-        read = _points(seen.range_m[detection], np.where(known, bearing, np.nan))
-        point = se2.transform(np.array(recording.sensor.mount_robot_sensor, dtype=np.float64), read)
-        read = np.where(known[:, None], read, _points(seen.range_m[detection], expected[:, 1]))
+        range_m, known = expected[:, 0], _has_bearing(recording)[detection]
+        bearing = np.where(known, seen.bearing_rad[detection], expected[:, 1])
+        read = _points(seen.range_m[detection], bearing)
         expected = _points(range_m, expected[:, 1])
     off = (read - expected) / np.maximum(range_m, 1e-9)[:, None]
     good = np.isfinite(off).all(axis=1)
     named, used = innovations.landmark_id[keep[good]], innovations.p_inlier[keep[good]] >= USED
-    return Compared(detection[good], taken_s[keep[good]], named, used, range_m[good], off[good], point[good])
+    point = locate_detections(recording)[detection[good]]
+    return Compared(detection[good], taken_s[keep[good]], named, used, range_m[good], off[good], point)
+
+
+def locate_detections(recording: AnyRecording) -> FloatArray:
+    """Return (M, D) where detections are in the robot's frame [m]; nan of those with a direction or a range only."""
+    if not is_in_space(recording):
+        seen = recording.detections
+        read = _points(seen.range_m, np.where(_has_bearing(recording), seen.bearing_rad, np.nan))
+        return np.asarray(se2.transform(np.array(recording.sensor.mount_robot_sensor, dtype=np.float64), read))
+    from evermap.slam.space.intake import positions_of, without_range
+
+    mounts = np.array([one.mount_robot_sensor for one in recording.sensors])[recording.detections.sensor]
+    point = se3.transform(mounts, positions_of(recording))
+    return np.where(without_range(recording)[:, None], np.nan, point)
+
+
+def find_instants(recording: AnyRecording, result: SlamResult) -> FloatArray:
+    """Return (M,) when detections were taken, by the clock of a result's poses [s]."""
+    return recording.frames.stamp_s[recording.detections.frame] - _find_delays_s(recording, result)
+
+
+def _has_bearing(recording: Recording) -> BoolArray:
+    seen = recording.detections
+    return np.isfinite(seen.bearing_rad) & ~(seen.sigma_bearing_rad >= ANY_BEARING_RAD)
 
 
 def _find_delays_s(recording: AnyRecording, result: SlamResult) -> FloatArray:
-    """Return (K,) by how much stamps of detections are late, as was estimated of the sensors in space."""
-    row = result.innovations.detection
+    """Return (M,) by how much stamps of detections are late, as was estimated of the sensors in space."""
     if not is_in_space(recording):
-        return np.zeros(len(row))
+        return np.zeros(len(recording.detections))
     value = {each.name: each.value for each in result.parameters}
     delay_s = np.array([value.get(f"{one.name}_delay_s", 0.0) for one in recording.sensors])
-    return np.asarray(delay_s[recording.detections.sensor[np.minimum(row, len(recording.detections) - 1)]])
+    return np.asarray(delay_s[recording.detections.sensor])
 
 
 def _points(range_m: FloatArray, bearing_rad: FloatArray) -> FloatArray:

@@ -9,8 +9,9 @@ over what another one does, it is a sensor that is wrong, not the ids.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,6 +68,13 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SlamConfig) -> 
     if twice:
         warnings.append(f"landmark_id {', '.join(twice)}: on two landmarks, seen at two places at once; not used")
     return replace(recording, detections=replace(given, landmark_id=landmark_id), warnings=tuple(warnings))
+
+
+def without_identities(recording: Any, landmark_id: Collection[int]) -> Any:
+    """Return the recording with the detections of some identities as of no landmark."""
+    seen = recording.detections
+    name = np.where(np.isin(seen.landmark_id, list(landmark_id)), UNKNOWN, seen.landmark_id)
+    return replace(recording, detections=replace(seen, landmark_id=name))
 
 
 def list_doubled_ids(as_read: AnyRecording, recording: AnyRecording) -> IntArray:

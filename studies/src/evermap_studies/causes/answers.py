@@ -45,7 +45,7 @@ def _answer(verdicts: frozenset[VerdictKind], codes: str, words: str, states: st
 
 
 _SCALES = "length-unit odometer-scale odometry-scale range-scale scale forward-scale "
-_CLOCKS = "clock delay sensor-delay clock-drift clock-step "
+_CLOCKS = "clock delay sensor-delay clock-drift clock-step clock-jitter "
 _MOUNTS = "mount mount-axes mount-flip mount-angle mount-position sensor-mount "
 _LENSES = "lens focal focal-axes focal-length intrinsics distortion camera-lens calibration "
 _SITES = "map-site another-site other-site map-frame map "
@@ -58,6 +58,7 @@ ANSWERS = {
     "noise": Answer(SOUND, is_optional=True),
     "anything": Answer(REFUSED | OUTDATED, is_optional=True),
     "change": Answer(SOUND | OUTDATED, is_change=True),
+    "carried": _answer(MENDED, "carried-about", "carried"),
     "wrong identity": _answer(
         MENDED, "identity wrong-identity duplicate-identity duplicate double-identity rides-along", "identit"
     ),

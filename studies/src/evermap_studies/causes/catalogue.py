@@ -615,7 +615,7 @@ def _attacks() -> list[World]:
     add(
         "laser corners poses",
         "a landmark that is carried about",
-        "change",
+        "carried",
         wrong.identities_stay,
         wrong.wandering(0.4),
         seeds=3,

@@ -308,7 +308,7 @@ def true_changes(case: Case) -> dict[int, TrueChange]:
         shift = last.pose[:3] - was[:3]
         exchanged = len(by_row) == 2 and tuple(np.round(event.pose[:3], 6)) in starts
         kind = "exchanged" if exchanged else "moved" if np.linalg.norm(shift) > 1e-6 else "turned"
-        found[identity] = TrueChange(kind, shift, event.at_s)
+        found[identity] = TrueChange(kind, shift, event.at_s, ANSWERS[case.world.cause].is_change)
     if not found and case.given.places is not None and "edition" in case.world.name:
         given, true = case.given.places, case.given.true_places
         _, mine, theirs = np.intersect1d(given.landmark_id, true.landmark_id, return_indices=True)

@@ -1,0 +1,119 @@
+"""Landmarks that are carried about while one drives: a tag on a cart, on another robot, in the hands of a person.
+
+One that moved once is at two places, and so is an identity that two landmarks carry. What is carried about is at many,
+from one look to the next hardly elsewhere. Its sightings say nothing of where the robot is: they bend the poses, or a
+map has it moved to where it happened to be last. Wrong identities are elsewhere for a look, and a landmark of another
+size than stated is at one place once it is as far as its size says.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.explain.symptoms import compare_detections, find_instants, find_poses_at, locate_detections
+from evermap.geometry import se2, se3
+from evermap.types import UNKNOWN, AnyRecording, BoolArray, Cause, FloatArray, IntArray, SlamResult
+
+CARRIED = "carried-about"
+"""Code of the cause."""
+APART_M, SCATTERS = 0.3, 5.0
+"""Radius of a place, at least [m], and over what detections are usually off by at such a range."""
+FEWEST, MOST = 12, 400
+"""Sightings of a landmark from which it is asked, and that are compared, at most."""
+AT_TWO, ELSEWHERE = 0.85, 5
+"""Share of the sightings at the two places with most of them, at most, and how many are elsewhere, at least."""
+NEXT_S, JOINED = 1.0, 0.8
+"""Time between sightings that follow each other, and the share of those elsewhere that must be near such a one."""
+SURELY = 3.0
+"""Standard deviations of the positions of poses within which a landmark is at one place."""
+SHARE = 0.2
+"""Share of the landmarks that may be carried about: where more seem to be, the poses are wrong."""
+SIZES = np.exp(np.arange(-0.7, 0.75, 0.1))
+"""Sizes of a landmark over what is stated, under which it may be at one place."""
+
+
+class Carried(NamedTuple):
+    """A landmark that is carried about: its identity, at how many places it was seen, how far these are apart [m]."""
+
+    landmark_id: int
+    places: int
+    apart_m: float
+
+
+def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, ...]:
+    """Return landmarks that are carried about, by where their detections put them along the trajectory of a result.
+
+    Args:
+        result: of the recording, or of one without some of its identities.
+        recording: as it was read.
+    """
+    compared = compare_detections(recording, result) if len(result.innovations) else None
+    if compared is None or np.count_nonzero(compared.used) < FEWEST:
+        return ()
+    usual, dim = float(np.median(compared.misfit[compared.used])), recording.dim
+    variance = np.trace(result.trajectory.covariance[:, :dim, :dim], axis1=1, axis2=2)
+    least_m = max(APART_M, SURELY * float(np.sqrt(np.median(variance))))
+    taken_s, point_m = find_instants(recording, result), locate_detections(recording)
+    pose, near = find_poses_at(result.trajectory, taken_s)
+    group: Any = se2 if pose.shape[1] == 3 else se3
+    usable = near & np.isfinite(point_m).all(axis=1) & (recording.detections.landmark_id != UNKNOWN)
+    name, count = np.unique(recording.detections.landmark_id[usable], return_counts=True)
+    often, found = name[count >= FEWEST], list[Carried]()
+    for identity in often.tolist():
+        rows = np.flatnonzero(usable & (recording.detections.landmark_id == identity))
+        rows = rows[np.argsort(taken_s[rows], kind="stable")]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST)).astype(np.int64))]
+
+        def put(size: float, rows: IntArray = rows) -> tuple[FloatArray, FloatArray]:
+            far = size * np.linalg.norm(point_m[rows], axis=1)
+            return group.transform(pose[rows], size * point_m[rows]), np.maximum(least_m, SCATTERS * usual * far)
+
+        at, radius_m = put(1.0)
+        shares, elsewhere = _fill_places(at, radius_m)
+        if sum(shares[:2]) > AT_TWO or np.count_nonzero(elsewhere) < ELSEWHERE:
+            continue
+        if np.mean(_follow(at, radius_m, taken_s[rows])[elsewhere]) < JOINED:
+            continue
+        if max(_fill_places(*put(size))[0][0] for size in SIZES.tolist()) > AT_TWO:
+            continue
+        apart_m = float(np.linalg.norm(np.ptp(at, axis=0)))
+        found.append(Carried(identity, len(shares), apart_m))
+    return tuple(found) if len(found) <= SHARE * len(often) else ()
+
+
+def _fill_places(at: FloatArray, radius_m: FloatArray) -> tuple[list[float], BoolArray]:
+    """Return shares of sightings (N, D) at places of radii (N,), the fullest first, each without those before it; and
+    which are at neither of the first two.
+    """
+    near = np.linalg.norm(at[:, None] - at, axis=2) < radius_m[:, None]
+    left, shares = np.ones(len(at), dtype=np.bool_), list[float]()
+    elsewhere = left
+    while left.any():
+        count = (near & left).sum(axis=1)
+        fullest = int(np.argmax(count))
+        shares.append(float(count[fullest]) / len(at))
+        left = left & ~near[fullest]
+        elsewhere = left if len(shares) <= 2 else elsewhere
+    return shares, elsewhere
+
+
+def _follow(at: FloatArray, radius_m: FloatArray, taken_s: FloatArray) -> BoolArray:
+    """Return which sightings (N, D), in order of time, are near the one before or the one after, within a moment."""
+    near = np.linalg.norm(np.diff(at, axis=0), axis=1) < 0.5 * radius_m[:-1]
+    near &= np.diff(taken_s) <= NEXT_S
+    return np.asarray(np.append(near, False) | np.append(False, near))
+
+
+def name_carried(carried: Carried, recording: AnyRecording) -> Cause:
+    """Return that a landmark is carried about, as a cause that is put right: its detections are not used."""
+    name = str(recording.landmark_names.get(carried.landmark_id, carried.landmark_id))
+    message = (
+        f"landmark {name} is carried about: it was seen at {carried.places} places, up to {carried.apart_m:.3g} m "
+        "apart; its detections are not used"
+    )
+    return Cause(
+        CARRIED, name, message, carried.apart_m, math.nan, 1.0, "detections.csv: none of what moves about, on its own"
+    )

@@ -1,0 +1,168 @@
+"""A landmark that is carried about is at many places: it is named, and its detections are not used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from evermap import Config, run_slam
+from evermap.explain.carried import APART_M, AT_TWO, CARRIED, ELSEWHERE, _fill_places, find_carried
+from evermap.explain.symptoms import find_instants, find_poses_at, locate_detections
+from evermap.geometry import se2
+from evermap.slam.plane import in_its_space
+from evermap.types import UNKNOWN, AnyRecording, SlamResult, VerdictKind
+
+from .worlds import World
+
+NAME = 2
+STEP_S = 2.0
+
+
+def wander(stamp_s: np.ndarray, speed_mps: float = 0.4) -> np.ndarray:
+    """(N, 2) displacements: another one every two seconds."""
+    step = np.random.default_rng(5).normal(0.0, STEP_S * speed_mps / np.sqrt(2.0), (100, 2))
+    return np.cumsum(step, axis=0)[(stamp_s / STEP_S).astype(int)]
+
+
+def move_once(stamp_s: np.ndarray) -> np.ndarray:
+    return np.where(stamp_s[:, None] > 18.0, [[1.2, 0.9]], 0.0)
+
+
+def move_and_return(stamp_s: np.ndarray) -> np.ndarray:
+    return np.where((stamp_s[:, None] > 12.0) & (stamp_s[:, None] < 26.0), [[1.2, 0.9]], 0.0)
+
+
+def carry(recording: Any, how: Callable[[np.ndarray], np.ndarray], name: int = NAME) -> Any:
+    """The recording with a landmark displaced by (x, y) at its instants, by the true poses."""
+    seen, taken_s = recording.detections, recording.frames.stamp_s[recording.detections.frame]
+    by = np.where((seen.landmark_id == name)[:, None], how(taken_s), 0.0)
+    pose = recording.truth.pose_world_robot[seen.frame]
+    if recording.dim == 2:
+        turn, (range_m, bearing) = pose[:, 2], (seen.range_m, seen.bearing_rad)
+        x = range_m * np.cos(bearing) + by[:, 0] * np.cos(turn) + by[:, 1] * np.sin(turn)
+        y = range_m * np.sin(bearing) - by[:, 0] * np.sin(turn) + by[:, 1] * np.cos(turn)
+        return replace(recording, detections=replace(seen, range_m=np.hypot(x, y), bearing_rad=np.arctan2(y, x)))
+    mount = Rotation.from_quat([recording.sensors[one].mount_robot_sensor[3:] for one in seen.sensor])
+    axes = Rotation.from_quat(pose[:, 3:]) * mount
+    at = seen.position_sensor_m + axes.inv().apply(np.column_stack([by, np.zeros(len(by))]))
+    return replace(recording, detections=replace(seen, position_sensor_m=at))
+
+
+def make_plane(seed: int = 3) -> Any:
+    return World(seed=seed).plane()
+
+
+def make_space(seed: int = 3) -> Any:
+    return World(seed=seed).space(corners=False)
+
+
+def list_codes(result: SlamResult) -> list[str]:
+    return [cause.code for cause in result.causes]
+
+
+@pytest.mark.parametrize("in_map", [False, True])
+@pytest.mark.parametrize("make", [make_plane, make_space])
+def test_what_is_carried_about_is_named_and_not_used(make: Any, in_map: bool) -> None:
+    given = make()
+    wrong = carry(given, wander)
+    known = given.true_landmarks if in_map else None
+    result = run_slam(wrong, prior_map=known)
+    (cause,) = result.causes
+    assert (cause.code, cause.subject, cause.probability) == (CARRIED, str(NAME), 1.0)
+    (found,) = find_carried(result, in_its_space(wrong, Config().slam, dim=given.dim if in_map else None))
+    assert found.landmark_id == NAME
+    assert cause.value == found.apart_m
+    taken_s = wrong.frames.stamp_s[wrong.detections.frame[wrong.detections.landmark_id == NAME]]
+    true_m = float(np.linalg.norm(np.ptp(wander(taken_s), axis=0)))
+    assert found.apart_m == pytest.approx(true_m, abs=0.3)
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SOUND
+    assert cause in result.verdict.causes
+    assert not result.changes
+    assert not (result.innovations.landmark_id == NAME).any()
+    if not in_map:  # as without it
+        seen = given.detections
+        name = np.where(seen.landmark_id == NAME, UNKNOWN, seen.landmark_id)
+        alone = run_slam(replace(given, detections=replace(seen, landmark_id=name)))
+        same = alone.trajectory.pose_world_robot
+        np.testing.assert_allclose(result.trajectory.pose_world_robot, same, atol=1e-4)
+
+
+@pytest.mark.parametrize("how", [move_once, move_and_return])
+@pytest.mark.parametrize("make", [make_plane, make_space])
+def test_what_moves_between_two_places_is_not_carried_about(make: Any, how: Any) -> None:
+    wrong = carry(make(), how)
+    assert CARRIED not in list_codes(run_slam(wrong))
+    assert not find_carried(run_slam(make()), in_its_space(wrong, Config().slam))
+
+
+@pytest.mark.parametrize("size", [0.85, 1.3])
+def test_a_landmark_of_another_size_is_not_carried_about(size: float) -> None:
+    """Its detections are too near or too far: along the drive they are at many places."""
+    wrong = World(seed=3, sizes={NAME: size}).plane()
+    result = run_slam(make_plane())
+    at, radius_m = put_along(result, wrong)
+    shares, elsewhere = _fill_places(at, radius_m)
+    assert sum(shares[:2]) < AT_TWO  # as of what is carried about
+    assert np.count_nonzero(elsewhere) > ELSEWHERE
+    assert not find_carried(result, wrong)
+
+
+def put_along(result: SlamResult, recording: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Where detections of the landmark are, and radii of a place."""
+    rows = np.flatnonzero(recording.detections.landmark_id == NAME)
+    pose = find_poses_at(result.trajectory, find_instants(recording, result)[rows])[0]
+    at = se2.transform(pose, locate_detections(recording)[rows])
+    return at, np.full(len(rows), APART_M)
+
+
+def test_identities_that_are_misread_are_not_carried_about() -> None:
+    """One that is read of any other for a look."""
+    given, random = make_plane(), np.random.default_rng(2)
+    seen, name = given.detections, given.detections.landmark_id.copy()
+    rows, others = np.flatnonzero(name == NAME), np.flatnonzero(name != NAME)
+    name[random.choice(rows, len(rows) // 2, replace=False)] = UNKNOWN
+    name[random.choice(others, len(rows) // 2, replace=False)] = NAME
+    wrong, result = replace(given, detections=replace(seen, landmark_id=name)), run_slam(given)
+    assert sum(_fill_places(*put_along(result, wrong))[0][:2]) < AT_TWO
+    assert not find_carried(result, wrong)
+
+
+def test_of_many_landmarks_not_all_are_carried_about() -> None:
+    """Where a few are, it is they; where more seem to be, it is the poses."""
+    given, result = make_plane(), run_slam(make_plane())
+    few, many = given, given
+    for name in range(2):
+        few = carry(few, wander, name)
+    for name in range(5):
+        many = carry(many, wander, name)
+    assert [one.landmark_id for one in find_carried(result, few)] == [0, 1]
+    assert not find_carried(result, many)
+
+
+def test_where_poses_are_hardly_known_nothing_is_carried_about() -> None:
+    wrong, result = carry(make_plane(), wander), run_slam(make_plane())
+    path = result.trajectory
+    vague = replace(result, trajectory=replace(path, covariance=path.covariance + np.eye(3)))
+    assert find_carried(result, wrong)
+    assert not find_carried(vague, wrong)
+
+
+def test_a_person_who_walks_slowly_is_found_and_one_who_leans_is_not() -> None:
+    result = run_slam(make_plane())
+
+    def lean(stamp_s: np.ndarray) -> np.ndarray:
+        return 0.14 * np.column_stack([np.sin(stamp_s), np.cos(stamp_s)])
+
+    def stroll(stamp_s: np.ndarray) -> np.ndarray:
+        return np.column_stack([0.05 * stamp_s, 0.0 * stamp_s])
+
+    path = result.trajectory
+    result = replace(result, trajectory=replace(path, covariance=0.01 * path.covariance))  # of a few millimetres
+    found: list[AnyRecording] = [carry(make_plane(), how) for how in (stroll, lean)]
+    assert [len(find_carried(result, each)) for each in found] == [1, 0]
