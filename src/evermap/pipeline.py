@@ -48,6 +48,7 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.explain.causes import Inputs
+    from evermap.explain.trial import SessionSolution
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
@@ -80,21 +81,25 @@ def run_slam(
             config = _without_changes(config)
     given = Inputs.of(recording, prior_map)
 
-    def conclude(**more: Any) -> SlamResult:
-        visit, result, under = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
+    def conclude(**more: Any) -> tuple[SlamResult, SessionSolution[session.Visit]]:
+        visit, result, asked = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
+        solution = SessionSolution(visit, asked, result)
         result = replace(session.existing(visit, result, config.living), association=evidence)
         if prior_map is not None:
             expected = prior_map[~np.isin(prior_map.landmark_id, doubled)]  # what was read was not missed
             result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
-        return _judge(
-            result, under.recording, config, under.prior_map, found, doubled,
-            as_read=read, session=session.solution_of(visit),
+        result = _judge(
+            result, asked.inputs.recording, config, asked.inputs.prior_map, found, doubled,
+            as_read=read, asked=asked,
         )  # fmt: skip
+        return result, solution
 
-    result = conclude(realtime=realtime, progress=progress)
+    result, solution = conclude(realtime=realtime, progress=progress)
     if result.causes or realtime or not config.slam.explain.on or not _is_held(result):
         return result
-    return conclude(is_suspected=True)  # its scores cost too much to be asked before all else is sound
+    return conclude(is_suspected=True, solution=solution)[
+        0
+    ]  # its scores cost too much to be asked before all else is sound
 
 
 def _without_changes(config: Config) -> Config:

@@ -234,7 +234,8 @@ def test_what_is_usual_of_odometry_is_marginalised(problem: tuple, monkeypatch: 
     sigma = scores.USUAL_SHARE * np.array([3.0, 8.0])
     wider = own + (directions.T * sigma**2) @ directions
     exact = multivariate_normal(cov=wider).logpdf(measured) - multivariate_normal(cov=own).logpdf(measured)
-    anything: Any = cast("Any", None)
-    assert scores.weigh_usual(anything, optimum, anything) == pytest.approx(float(exact), abs=1e-6)
+    asked = scores.ScreenedSession(cast("Any", None), cast("Any", None))
+    monkeypatch.setattr(scores, "optimum_of", lambda _: optimum)
+    assert scores.weigh_usual(asked) == pytest.approx(float(exact), abs=1e-6)
     monkeypatch.setattr(scores, "_is_state", lambda *_: True)
-    assert scores.weigh_usual(anything, optimum, anything) == 0.0
+    assert scores.weigh_usual(asked) == 0.0

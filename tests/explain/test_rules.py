@@ -28,7 +28,7 @@ def suspect(code: str = "tag-size", subject: str = "5", sigma: float = 0.3, p: f
 
 
 def trial(evidence: float, *taken: Taken, noise: float = 1.0, worth: float = 1.0, result: object = None) -> Trial[Any]:
-    return Trial(cast("Any", None), cast("Any", SimpleNamespace(result=result)), taken, evidence, worth, noise)
+    return Trial(cast("Any", SimpleNamespace(result=result, inputs=None)), taken, evidence, worth, noise)
 
 
 def test_a_solution_that_ignores_a_sensor_loses_to_one_that_hears_it() -> None:
@@ -91,7 +91,7 @@ def test_a_cause_must_explain_something_that_was_asked(
     monkeypatch.setattr(competition, "find_symptoms", lambda result, *_: (before, after)[result])
     monkeypatch.setattr(competition, "count_changed", lambda result: changed[result])
     monkeypatch.setattr(competition, "share_rejected", lambda result: rejected[result])
-    monkeypatch.setattr("evermap.explain.trial.find_score", lambda solution, _: unexplained[solution.result])
+    monkeypatch.setattr("evermap.explain.trial.find_score", lambda solution: unexplained[solution.result])
     monkeypatch.setattr(competition, "contradicts_odometry", lambda result, _: False)
     assert competition._relieves(now, best, SlamConfig()) is relieves
 
