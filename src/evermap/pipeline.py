@@ -97,9 +97,8 @@ def run_slam(
     result, solution = conclude(realtime=realtime, progress=progress)
     if result.causes or realtime or not config.slam.explain.on or not _is_held(result):
         return result
-    return conclude(is_suspected=True, solution=solution)[
-        0
-    ]  # its scores cost too much to be asked before all else is sound
+    # its scores cost too much to be asked before all else is sound
+    return conclude(is_suspected=True, solution=solution)[0]
 
 
 def _without_changes(config: Config) -> Config:
