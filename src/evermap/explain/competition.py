@@ -99,7 +99,8 @@ def explain(
             return Explained(sound, find_put_right(solution.result, inputs, config))
         few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
         if symptoms in ((CHANGES,), (SINGLE,)) and few and not (is_suspected or find_score(solution) > 0.0):
-            screens = screens[:1]  # of a landmark or two, and no calibration earns anything
+            # of a landmark or two, and no calibration earns anything: what is of all has other symptoms
+            screens = (partial(screen_plain, of_some=symptoms == (SINGLE,)),)
     base = None if solution is None else weigh_solution(solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = Budget(rules.most_solutions)
@@ -108,7 +109,7 @@ def explain(
     for _ in range(rules.most_causes):
         given = inputs if best is None else best.inputs  # what is wrong with the drive bends its shape
         alone = _solve_alone(best, given, solve_under, rules.rejected, budget)
-        shown: tuple[Callable[..., Asked], ...] = (partial(screen_plain, alone=alone), *screens[1:])
+        shown: tuple[Callable[..., Asked], ...] = (partial(screens[0], alone=alone), *screens[1:])
         found = _next_cause(best, inputs, solve_under, config, budget, weighed, shown)
         if found is None:
             break

@@ -71,8 +71,13 @@ def screen_plain(
     suspects: list[Suspect],
     config: SlamConfig,
     alone: SlamResult | None = None,
+    *,
+    of_some: bool = False,
 ) -> list[tuple[float, Suspect, float]]:
-    """Return causes that show without a solution, in one that fails, or in one without the map, `alone`."""
+    """Return causes that show without a solution, in one that fails, or in one without the map, `alone`; `of_some`: of
+    these those of some detections, by what was seen or by the sensor.
+    """
+    suspects = [one for one in suspects if one.rows is not None] if of_some else suspects
     seeds = _by_seeds(best, inputs, suspects, config)
     of_map = _by_shape(alone, inputs, suspects, seeds)
     if of_map is None:
