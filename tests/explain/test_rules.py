@@ -12,7 +12,7 @@ import pytest
 
 from evermap import run_slam
 from evermap.config import Config, SlamConfig
-from evermap.explain import competition, seeds, triggers
+from evermap.explain import competition, screens, seeds, triggers
 from evermap.explain.answer import list_causes
 from evermap.explain.causes import Inputs, Suspect
 from evermap.explain.evidence import Score
@@ -138,8 +138,19 @@ def test_a_cause_names_what_explains_the_same_without_it() -> None:
     assert by_code == {"tag-size": str(wheels.state), "odometry-scale": str(size.state)}
 
 
+def test_causes_that_were_found_in_another_order_are_one_explanation() -> None:
+    nothing = SimpleNamespace(parameters=())
+    size, wheels, late = (Taken(suspect(code, code), 0.05) for code in ("tag-size", "odometry-scale", "clock"))
+    base, best = trial(-50.0, result=nothing), trial(0.0, size, wheels, result=nothing)
+    again, other = trial(-0.5, wheels, size, result=nothing), trial(-1.0, size, late, result=nothing)
+    first, *_ = list_causes(best, [base, again, best, other], base)
+    by_code = {one.code: one.probability for one in list_causes(best, [base, again, best, other], base)}
+    assert (first.code, first.probability) == ("tag-size", pytest.approx(1.0))
+    assert by_code["odometry-scale"] == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))
+
+
 def test_scales_that_a_solution_found_by_itself_are_causes_of_it() -> None:
-    """They share the probability of what undoes them, and lose that of what explains the same."""
+    """What undoes them is the same explanation, and counts once; what explains the same as well is another one."""
     nothing = SimpleNamespace(parameters=())
     ranges, of_map = (Taken(suspect(code, subject), 0.05) for code, subject in (("range-scale", "sensor"), ("map", "")))
     base, undone = trial(0.0, result=nothing), trial(-1.0, ranges, result=nothing)
@@ -151,10 +162,10 @@ def test_scales_that_a_solution_found_by_itself_are_causes_of_it() -> None:
         return list_causes(best, weighed, base, lambda one: found_own.get(id(one), []))
 
     (cause,) = list_of(base, [base, undone, other])
-    price = ranges.suspect.log_p
-    shares = np.exp([0.0, undone.beats(base), other.beats(base)])
-    assert price == of_map.suspect.log_p
-    assert cause.probability == pytest.approx((shares[0] + shares[1]) / shares.sum())
+    expected = 1.0 / (1.0 + math.exp(other.beats(base)))
+    assert ranges.suspect.log_p == of_map.suspect.log_p
+    assert cause.probability == pytest.approx(expected)
+    assert list_of(base, [base, other])[0].probability == pytest.approx(expected)
     assert (cause.code, cause.instead) == ("range-scale", str(of_map.state))
     (cause,) = list_of(other, [base, other])
     assert (cause.code, cause.instead) == ("map", "ranges are long")
@@ -189,6 +200,16 @@ def test_a_cause_that_a_solution_has_is_left_for_one_that_is_likelier(
     anything = cast("Any", None)
     found = competition._next_cause(base, anything, anything, SlamConfig(), anything, [base], ())
     assert (found is tried) is wins
+
+
+def test_where_the_distance_of_one_is_odd_sizes_of_some_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = [suspect("odometry-scale"), replace(suspect(subject="5"), rows=("id", "5")), suspect(subject="all tags")]
+    monkeypatch.setattr(screens, "_by_seeds", lambda _, __, asked, ___: [(math.inf, one, 0.1) for one in asked])
+    monkeypatch.setattr(screens, "screen_pairs", lambda *_: [])
+    anything = cast("Any", None)
+    found = screens.screen_plain(anything, anything, every, SlamConfig(), of_some=True)
+    assert [one for _, one, _ in found] == [every[1]]
+    assert len(screens.screen_plain(anything, anything, every, SlamConfig())) == 3
 
 
 def test_every_state_pays_for_how_well_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
