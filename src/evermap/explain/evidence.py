@@ -33,6 +33,7 @@ from evermap.slam.changes.gain import PLANE, log_onset, log_prior
 from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
 from evermap.slam.linearise import PlacePriors, detection_residuals
+from evermap.slam.noise import gain_without_start
 from evermap.slam.room import ROOM_M, hold_in_room
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.against_map import log_map_density
@@ -205,6 +206,19 @@ def price_scales(optimum: Optimum) -> tuple[float, float]:
 
 def _log_normal(off: float, variance: float) -> float:
     return -0.5 * (off**2 / variance + math.log(variance) + LOG_2PI)
+
+
+def weigh_levels(session: AnySession) -> float:
+    """Return by how much the log evidence of a solution is larger at noise levels that no start has pulled [nats].
+
+    In the plane, where few steps of odometry say what a level is (`slam.noise.gain_without_start`).
+    """
+    if not isinstance(session, Solved) or not session.settings.estimate_noise:
+        return 0.0
+    outcome, values = session.outcome, session.outcome.graph_estimate
+    inlier = outcome.smoother.inlier_probability(values)
+    start = intake.beliefs(session.recording.sensor, session.settings)[1]
+    return gain_without_start(outcome.problem, values, outcome.fit_marginals, inlier, outcome.noise.noise, start)
 
 
 def used_rows(session: AnySession) -> IntArray:

@@ -19,6 +19,7 @@ from evermap.explain.evidence import (
     price_changes,
     price_scales,
     used_rows,
+    weigh_levels,
 )
 from evermap.explain.linearise import change_by
 from evermap.explain.scores import ScreenedSession, score_session, weigh_usual
@@ -282,5 +283,5 @@ def weigh_solution(solution: SessionSolution[VisitT], taken: tuple[Taken, ...]) 
     evidence -= anywhere * inputs.recording.dim * (math.log(ROOM_M) + 0.5 * LOG_2PI)
     noise = max((one.value for one in solution.result.parameters if one.name.endswith(OF_NOISE[0])), default=1.0)
     meant, found = price_scales(optimum)
-    evidence += meant - found + weigh_usual(solution.asked) + sum(map(_state_evidence, taken))
+    evidence += meant - found + weigh_usual(solution.asked) + weigh_levels(session) + sum(map(_state_evidence, taken))
     return Trial(solution, taken, evidence, optimum.worth, noise, meant)
