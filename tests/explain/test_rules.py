@@ -15,9 +15,19 @@ from evermap.config import Config, SlamConfig
 from evermap.explain import competition, screens, seeds, triggers
 from evermap.explain.answer import list_causes
 from evermap.explain.causes import Inputs, Suspect
-from evermap.explain.evidence import Score
+from evermap.explain.evidence import Score, weigh_levels
 from evermap.explain.screens import FAR
-from evermap.explain.trial import Asked, Taken, Trial, _state_evidence, _with_last, with_information
+from evermap.explain.trial import (
+    Asked,
+    SessionSolution,
+    Taken,
+    Trial,
+    _state_evidence,
+    _with_last,
+    weigh_solution,
+    with_information,
+)
+from evermap.maps.sessions import session
 from evermap.types import Cause
 
 from .worlds import World
@@ -277,3 +287,37 @@ def test_a_landmark_has_another_size_only_where_all_sides_say_the_same(other: fl
     assert np.isfinite(found) == is_a_size
     if is_a_size:
         assert found == pytest.approx(np.log(2.0) - 0.5 * np.log(other), abs=0.05)
+
+
+@pytest.mark.parametrize("symptom", [triggers.SINGLE, triggers.CHANGES])
+def test_what_is_of_all_has_other_symptoms_than_the_distance_of_one(
+    symptom: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, base = list[bool](), trial(0.0, result=SimpleNamespace(landmarks=()))
+
+    def screen_plain(*_: object, of_some: bool, **__: object) -> Asked:
+        asked.append(of_some)
+        return []
+
+    monkeypatch.setattr(competition, "screen_plain", screen_plain)
+    monkeypatch.setattr(competition, "find_symptoms", lambda *_, **__: (symptom,))
+    for name, found in (
+        ("find_late_sensor", None), ("count_changed", 0), ("find_score", 0.0), ("weigh_solution", base),
+        ("_solve_alone", None), ("_find_own", ()), ("list_suspects", ()), ("_is_metre_known", True),
+        ("find_put_right", ()),
+    ):  # fmt: skip
+        monkeypatch.setattr(competition, name, lambda *_, found=found, **__: found)
+    anything = cast("Any", None)
+    assert competition.explain(anything, base.solution, anything, SlamConfig()) is not None
+    assert asked == [symptom == triggers.SINGLE]
+
+
+def test_evidence_is_that_at_levels_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs, config = Inputs.of(World(seed=1, seconds=10.0).plane(), None), Config()
+    visit, result, asked = session.explained(inputs, config, ())
+    solution = SessionSolution(visit, asked, result)
+    before = weigh_solution(solution, ()).evidence
+    gained = weigh_levels(asked.session)
+    assert gained > 0.0
+    monkeypatch.setattr("evermap.explain.trial.weigh_levels", lambda one: 7.0 if one is asked.session else math.nan)
+    assert weigh_solution(solution, ()).evidence == pytest.approx(before - gained + 7.0)
