@@ -51,6 +51,7 @@ def run_slam(
     from evermap.explain.carried import Carried, find_carried, name_carried
     from evermap.explain.causes import Inputs
     from evermap.explain.faults import with_mended
+    from evermap.explain.trial import SessionSolution
     from evermap.explain.verdict import with_verdict
     from evermap.maps.sessions import nameless, session
     from evermap.slam import association, check, plane
@@ -84,31 +85,35 @@ def run_slam(
     if len(read.detections) != len(recording.detections):  # what rides along in the plane was left out
         read = recording
 
-    def conclude(given: Inputs, read: AnyRecording, not_missed: list[int], **more: Any) -> SlamResult:
-        visit, result, under = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
+    def conclude(
+        given: Inputs, read: AnyRecording, not_missed: list[int], **more: Any
+    ) -> tuple[SlamResult, SessionSolution[session.Visit]]:
+        visit, result, asked = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
+        solution = SessionSolution(visit, asked, result)
         result = replace(session.existing(visit, result, config.living), association=evidence)
         if prior_map is not None:
             expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
             result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
-        return _judge(
-            result, under.recording, config, under.prior_map, found, doubled,
-            as_read=read, session=session.solution_of(visit),
+        result = _judge(
+            result, asked.inputs.recording, config, asked.inputs.prior_map, found, doubled,
+            as_read=read, asked=asked,
         )  # fmt: skip
+        return result, solution
 
-    asked = Inputs.of(recording, prior_map), read, doubled.tolist()  # what was read was not missed
-    result, carried = conclude(*asked, realtime=realtime, progress=progress), tuple[Carried, ...]()
+    of_all = Inputs.of(recording, prior_map), read, doubled.tolist()  # what was read was not missed
+    (result, solution), carried = conclude(*of_all, realtime=realtime, progress=progress), tuple[Carried, ...]()
     if realtime or not config.slam.explain.on:
         return result
     if config.slam.unknown_ids is not True and (suspects := find_carried(result, read)):
         names = [one.landmark_id for one in suspects]
         rest, read_rest = without_identities(recording, names), without_identities(read, names)
-        without = Inputs.of(rest, prior_map), read_rest, [*asked[2], *names]
-        other = conclude(*without)
-        confirmed = find_carried(other, read)  # along poses that they do not bend
+        of_rest = Inputs.of(rest, prior_map), read_rest, [*of_all[2], *names]
+        other = conclude(*of_rest)
+        confirmed = find_carried(other[0], read)  # along poses that they do not bend
         if [one.landmark_id for one in confirmed] == names:
-            asked, result, carried = without, other, confirmed
-    if not result.causes and _is_held(result):
-        result = conclude(*asked, is_suspected=True)  # its scores cost too much to be asked before all else is sound
+            of_all, (result, solution), carried = of_rest, other, confirmed
+    if not result.causes and _is_held(result):  # its scores cost too much to be asked before all else is sound
+        result, _ = conclude(*of_all, is_suspected=True, solution=solution)
     return with_mended(result, tuple(name_carried(one, read) for one in carried))
 
 

@@ -12,8 +12,8 @@ from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.errors import NumericalError
 from evermap.explain.causes import Inputs, Suspect, list_suspects
-from evermap.explain.evidence import Screen, optimum_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
+from evermap.explain.scores import ScreenedSession
 from evermap.explain.screens import screen_pairs
 from evermap.explain.trial import Budget, SessionSolution, Solve, Trial, refine, solve_trial
 from evermap.geometry import se3
@@ -363,12 +363,12 @@ def test_mounts_that_are_turned_together_are_named() -> None:
 def test_a_step_that_rejects_detections_says_as_much_as_a_fine_one() -> None:
     """A mount turned by 6 mrad moves corners by many times their noise."""
     recording, survey = recorded(World(seed=1), "corners")
-    visit, _, inputs = session.explained(Inputs.of(recording, survey), without_causes(), ())
-    solved = session.solution_of(visit)
-    screen = Screen.of(optimum_of(solved))
-    for suspect in list_suspects(inputs, calibrations=True):
+    asked = session.explained(Inputs.of(recording, survey), without_causes(), ())[2]
+    for suspect in list_suspects(asked.inputs, calibrations=True):
         if suspect.code == "mount":
-            coarse, fine = (change_by(solved, screen, inputs, suspect, share) for share in (STEP, FINE_STEP))
+            coarse, fine = (
+                change_by(asked.session, asked.screen, asked.inputs, suspect, share) for share in (STEP, FINE_STEP)
+            )
             assert coarse is not None
             assert fine is not None
             assert np.linalg.norm(coarse - fine) < 0.1 * np.linalg.norm(fine), suspect.subject
@@ -379,7 +379,7 @@ def trial_under(inputs: Inputs, suspect: Suspect, state: float) -> tuple[Trial[V
 
     def solve_under(given: Inputs) -> SessionSolution[Visit]:
         visit = session.solved(given.recording, Config(), given.prior_map, ())
-        return SessionSolution(visit, session.solution_of(visit), visit.concluded())
+        return SessionSolution(visit, ScreenedSession(session.solution_of(visit), given), visit.concluded())
 
     trial = solve_trial(inputs, (), suspect, state, solve_under, Budget(1))
     assert trial is not None
@@ -416,7 +416,7 @@ def test_a_state_of_a_lens_that_was_undone_changes_residuals_smoothly() -> None:
     inputs = Inputs.of(*recorded(World(seed=8, bent=-0.2), "corners"))
     suspect = next(one for one in list_suspects(inputs) if one.code == "distortion")
     trial, _ = trial_under(inputs, suspect, -0.2)
-    solved, screen = trial.solution.session, Screen.of(optimum_of(trial.solution.session))
+    solved, screen = trial.solution.session, trial.solution.asked.screen
     coarse, fine = (
         change_by(solved, screen, trial.inputs, suspect, share, given=inputs, state=-0.2) for share in (STEP, FINE_STEP)
     )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
+from evermap.config import SlamConfig
+from evermap.config.slam import NoiseConfig
 from evermap.estimate.graph import Border, Graph, Layout, Room, build_structure, grouped
 from evermap.estimate.sparse.system import exhausted
 from evermap.explain import scores
@@ -22,9 +24,14 @@ from evermap.explain.evidence import (
     Screen,
     _in_own_room,
     evidence_at,
+    log_evidence,
     price_scales,
+    weigh_levels,
 )
+from evermap.slam.estimate import solve
 from evermap.slam.room import ROOM_M
+
+from .worlds import World
 
 N_POSES, N_PLACES = 6, 3
 
@@ -234,7 +241,29 @@ def test_what_is_usual_of_odometry_is_marginalised(problem: tuple, monkeypatch: 
     sigma = scores.USUAL_SHARE * np.array([3.0, 8.0])
     wider = own + (directions.T * sigma**2) @ directions
     exact = multivariate_normal(cov=wider).logpdf(measured) - multivariate_normal(cov=own).logpdf(measured)
-    anything: Any = cast("Any", None)
-    assert scores.weigh_usual(anything, optimum, anything) == pytest.approx(float(exact), abs=1e-6)
+    asked = scores.ScreenedSession(cast("Any", None), cast("Any", None))
+    monkeypatch.setattr(scores, "optimum_of", lambda _: optimum)
+    assert scores.weigh_usual(asked) == pytest.approx(float(exact), abs=1e-6)
     monkeypatch.setattr(scores, "_is_state", lambda *_: True)
-    assert scores.weigh_usual(anything, optimum, anything) == 0.0
+    assert scores.weigh_usual(asked) == 0.0
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_levels_without_what_was_imagined_are_worth_what_they_gain(seed: int) -> None:
+    """As of a solution that imagines next to nothing; its levels are half as large."""
+    recording, rules = World(seed=seed, seconds=60.0).plane(), SlamConfig(method="nohyp")
+
+    def imagine(count: float) -> Any:
+        return solve(recording, rules.model_copy(update={"noise": NoiseConfig(pseudo_count=count)}))
+
+    usual, free = imagine(1.0), imagine(1e-3)
+    assert free.outcome.noise.noise.odometry[2] < 0.6 * usual.outcome.noise.noise.odometry[2]
+    gained = log_evidence(free) - log_evidence(usual)
+    assert gained > 10.0
+    assert weigh_levels(usual) == pytest.approx(gained, rel=0.15)
+    assert 0.0 <= weigh_levels(free) < 0.05 * gained
+    values = usual.outcome.graph_estimate
+    pose = values.pose + np.random.default_rng(seed).normal(0.0, 0.3, values.pose.shape)
+    astray = replace(usual.outcome, graph_estimate=replace(values, pose=pose))
+    assert weigh_levels(replace(usual, outcome=astray)) < 10.0 * gained  # levels that are of nothing: not thousands
+    assert weigh_levels(replace(usual, settings=rules.model_copy(update={"estimate_noise": False}))) == 0.0

@@ -11,7 +11,7 @@ import pytest
 from evermap.config import Config
 from evermap.estimate.sparse.system import exhausted
 from evermap.explain.causes import Inputs, list_suspects
-from evermap.explain.evidence import Screen, optimum_of, residuals_of
+from evermap.explain.evidence import residuals_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by, change_by_motion
 from evermap.maps.sessions import session
 from evermap.slam.estimate import Solved
@@ -27,10 +27,9 @@ CONFIG = Config.model_validate({"slam": {"explain": {"on": False}}})
 def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised(*, in_map: bool) -> None:
     recording = World(seed=2).plane()
     given = recording.true_landmarks if in_map else None
-    visit, _, inputs = session.explained(Inputs.of(recording, given), CONFIG, ())
-    solved: Any = session.solution_of(visit)
+    screened = session.explained(Inputs.of(recording, given), CONFIG, ())[2]
+    solved, screen, inputs, asked = screened.session, screened.screen, screened.inputs, set()
     assert isinstance(solved, Solved)
-    screen, asked = Screen.of(optimum_of(solved)), set()
     graph, state, problem = screen.optimum.graph, screen.optimum.state, solved.outcome.problem
     for suspect in list_suspects(inputs, calibrations=True):
         found, step = change_by(solved, screen, inputs, suspect), STEP * suspect.sigma
@@ -54,9 +53,8 @@ def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised(*, in_
 
 
 def test_a_lens_changes_residuals_as_if_all_were_read_again() -> None:
-    visit, _, inputs = session.explained(Inputs.of(World(seed=2).space(corners=True), None), CONFIG, ())
-    solved = session.solution_of(visit)
-    screen, asked = Screen.of(optimum_of(solved)), 0
+    screened = session.explained(Inputs.of(World(seed=2).space(corners=True), None), CONFIG, ())[2]
+    solved, screen, inputs, asked = screened.session, screened.screen, screened.inputs, 0
     for suspect in list_suspects(inputs, calibrations=True):
         if suspect.code not in {"focal-length", "intrinsics", "distortion"}:
             continue
@@ -82,9 +80,8 @@ def test_noise_of_the_same_size_at_all_ranges_does_not_shrink_them() -> None:
     unstated = replace(seen, covariance_sensor_m2=np.full((len(seen), 3, 3), np.nan))
     sensors = tuple(replace(one, sigma_m=0.03) for one in recording.sensors)
     recording = replace(recording, detections=unstated, sensors=sensors)
-    visit, _, inputs = session.explained(Inputs.of(recording, None), CONFIG, ())
-    solved = session.solution_of(visit)
-    screen = Screen.of(optimum_of(solved))
+    screened = session.explained(Inputs.of(recording, None), CONFIG, ())[2]
+    solved, screen, inputs = screened.session, screened.screen, screened.inputs
     suspects = {one.code: one for one in list_suspects(inputs, calibrations=True)}
     ranges = change_by(solved, screen, inputs, suspects["range-scale"], FINE_STEP)
     driven = change_by_motion(solved, screen, inputs, suspects["odometry-scale"])

@@ -12,12 +12,22 @@ import pytest
 
 from evermap import run_slam
 from evermap.config import Config, SlamConfig
-from evermap.explain import competition, seeds, triggers
+from evermap.explain import competition, screens, seeds, triggers
 from evermap.explain.answer import list_causes
 from evermap.explain.causes import Inputs, Suspect
-from evermap.explain.evidence import Score
+from evermap.explain.evidence import Score, weigh_levels
 from evermap.explain.screens import FAR
-from evermap.explain.trial import Asked, Taken, Trial, _state_evidence, _with_last, with_information
+from evermap.explain.trial import (
+    Asked,
+    SessionSolution,
+    Taken,
+    Trial,
+    _state_evidence,
+    _with_last,
+    weigh_solution,
+    with_information,
+)
+from evermap.maps.sessions import session
 from evermap.types import Cause
 
 from .worlds import World
@@ -28,7 +38,7 @@ def suspect(code: str = "tag-size", subject: str = "5", sigma: float = 0.3, p: f
 
 
 def trial(evidence: float, *taken: Taken, noise: float = 1.0, worth: float = 1.0, result: object = None) -> Trial[Any]:
-    return Trial(cast("Any", None), cast("Any", SimpleNamespace(result=result)), taken, evidence, worth, noise)
+    return Trial(cast("Any", SimpleNamespace(result=result, inputs=None)), taken, evidence, worth, noise)
 
 
 def test_a_solution_that_ignores_a_sensor_loses_to_one_that_hears_it() -> None:
@@ -91,7 +101,7 @@ def test_a_cause_must_explain_something_that_was_asked(
     monkeypatch.setattr(competition, "find_symptoms", lambda result, *_: (before, after)[result])
     monkeypatch.setattr(competition, "count_changed", lambda result: changed[result])
     monkeypatch.setattr(competition, "share_rejected", lambda result: rejected[result])
-    monkeypatch.setattr("evermap.explain.trial.find_score", lambda solution, _: unexplained[solution.result])
+    monkeypatch.setattr("evermap.explain.trial.find_score", lambda solution: unexplained[solution.result])
     monkeypatch.setattr(competition, "contradicts_odometry", lambda result, _: False)
     assert competition._relieves(now, best, SlamConfig()) is relieves
 
@@ -138,8 +148,19 @@ def test_a_cause_names_what_explains_the_same_without_it() -> None:
     assert by_code == {"tag-size": str(wheels.state), "odometry-scale": str(size.state)}
 
 
+def test_causes_that_were_found_in_another_order_are_one_explanation() -> None:
+    nothing = SimpleNamespace(parameters=())
+    size, wheels, late = (Taken(suspect(code, code), 0.05) for code in ("tag-size", "odometry-scale", "clock"))
+    base, best = trial(-50.0, result=nothing), trial(0.0, size, wheels, result=nothing)
+    again, other = trial(-0.5, wheels, size, result=nothing), trial(-1.0, size, late, result=nothing)
+    first, *_ = list_causes(best, [base, again, best, other], base)
+    by_code = {one.code: one.probability for one in list_causes(best, [base, again, best, other], base)}
+    assert (first.code, first.probability) == ("tag-size", pytest.approx(1.0))
+    assert by_code["odometry-scale"] == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))
+
+
 def test_scales_that_a_solution_found_by_itself_are_causes_of_it() -> None:
-    """They share the probability of what undoes them, and lose that of what explains the same."""
+    """What undoes them is the same explanation, and counts once; what explains the same as well is another one."""
     nothing = SimpleNamespace(parameters=())
     ranges, of_map = (Taken(suspect(code, subject), 0.05) for code, subject in (("range-scale", "sensor"), ("map", "")))
     base, undone = trial(0.0, result=nothing), trial(-1.0, ranges, result=nothing)
@@ -151,10 +172,10 @@ def test_scales_that_a_solution_found_by_itself_are_causes_of_it() -> None:
         return list_causes(best, weighed, base, lambda one: found_own.get(id(one), []))
 
     (cause,) = list_of(base, [base, undone, other])
-    price = ranges.suspect.log_p
-    shares = np.exp([0.0, undone.beats(base), other.beats(base)])
-    assert price == of_map.suspect.log_p
-    assert cause.probability == pytest.approx((shares[0] + shares[1]) / shares.sum())
+    expected = 1.0 / (1.0 + math.exp(other.beats(base)))
+    assert ranges.suspect.log_p == of_map.suspect.log_p
+    assert cause.probability == pytest.approx(expected)
+    assert list_of(base, [base, other])[0].probability == pytest.approx(expected)
     assert (cause.code, cause.instead) == ("range-scale", str(of_map.state))
     (cause,) = list_of(other, [base, other])
     assert (cause.code, cause.instead) == ("map", "ranges are long")
@@ -189,6 +210,16 @@ def test_a_cause_that_a_solution_has_is_left_for_one_that_is_likelier(
     anything = cast("Any", None)
     found = competition._next_cause(base, anything, anything, SlamConfig(), anything, [base], ())
     assert (found is tried) is wins
+
+
+def test_where_the_distance_of_one_is_odd_sizes_of_some_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = [suspect("odometry-scale"), replace(suspect(subject="5"), rows=("id", "5")), suspect(subject="all tags")]
+    monkeypatch.setattr(screens, "_by_seeds", lambda _, __, asked, ___: [(math.inf, one, 0.1) for one in asked])
+    monkeypatch.setattr(screens, "screen_pairs", lambda *_: [])
+    anything = cast("Any", None)
+    found = screens.screen_plain(anything, anything, every, SlamConfig(), of_some=True)
+    assert [one for _, one, _ in found] == [every[1]]
+    assert len(screens.screen_plain(anything, anything, every, SlamConfig())) == 3
 
 
 def test_every_state_pays_for_how_well_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -256,3 +287,37 @@ def test_a_landmark_has_another_size_only_where_all_sides_say_the_same(other: fl
     assert np.isfinite(found) == is_a_size
     if is_a_size:
         assert found == pytest.approx(np.log(2.0) - 0.5 * np.log(other), abs=0.05)
+
+
+@pytest.mark.parametrize("symptom", [triggers.SINGLE, triggers.CHANGES])
+def test_what_is_of_all_has_other_symptoms_than_the_distance_of_one(
+    symptom: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, base = list[bool](), trial(0.0, result=SimpleNamespace(landmarks=()))
+
+    def screen_plain(*_: object, of_some: bool, **__: object) -> Asked:
+        asked.append(of_some)
+        return []
+
+    monkeypatch.setattr(competition, "screen_plain", screen_plain)
+    monkeypatch.setattr(competition, "find_symptoms", lambda *_, **__: (symptom,))
+    for name, found in (
+        ("find_late_sensor", None), ("count_changed", 0), ("find_score", 0.0), ("weigh_solution", base),
+        ("_solve_alone", None), ("_find_own", ()), ("list_suspects", ()), ("_is_metre_known", True),
+        ("find_put_right", ()),
+    ):  # fmt: skip
+        monkeypatch.setattr(competition, name, lambda *_, found=found, **__: found)
+    anything = cast("Any", None)
+    assert competition.explain(anything, base.solution, anything, SlamConfig()) is not None
+    assert asked == [symptom == triggers.SINGLE]
+
+
+def test_evidence_is_that_at_levels_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs, config = Inputs.of(World(seed=1, seconds=10.0).plane(), None), Config()
+    visit, result, asked = session.explained(inputs, config, ())
+    solution = SessionSolution(visit, asked, result)
+    before = weigh_solution(solution, ()).evidence
+    gained = weigh_levels(asked.session)
+    assert gained > 0.0
+    monkeypatch.setattr("evermap.explain.trial.weigh_levels", lambda one: 7.0 if one is asked.session else math.nan)
+    assert weigh_solution(solution, ()).evidence == pytest.approx(before - gained + 7.0)

@@ -28,8 +28,8 @@ from .worlds import World
 def scored(recording: AnyRecording, given: Landmarks | None) -> SessionScores:
     """Return what a session tells that is solved as given."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
-    visit, result, inputs = session.explained(Inputs.of(recording, given), config, ())
-    return score_session(session.solution_of(visit), inputs, result.trajectory)
+    _, result, asked = session.explained(Inputs.of(recording, given), config, ())
+    return score_session(asked, result.trajectory)
 
 
 def mounts(recording: SpatialRecording, how: Callable[[np.ndarray], np.ndarray]) -> SpatialRecording:

@@ -12,9 +12,8 @@ from evermap import run_slam
 from evermap.config import Config
 from evermap.explain import scores
 from evermap.explain.causes import Inputs, turn_less
-from evermap.explain.evidence import Screen, optimum_of
 from evermap.explain.put_right import add_put_right, solve_with_right_turns
-from evermap.explain.scores import TURN_BIAS, is_unusual, score_odometry
+from evermap.explain.scores import TURN_BIAS, ScreenedSession, is_unusual, score_odometry
 from evermap.explain.symptoms import Signs
 from evermap.explain.trial import Explained, SessionSolution, Taken, Trial
 from evermap.explain.verdict import judge_signs
@@ -34,8 +33,8 @@ def record(world: World, kind: str) -> Any:
 def score(recording: AnyRecording) -> dict[str, scores.CalibrationScore]:
     """Return what a session tells of odometry that is solved as given, by codes."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
-    visit, _, inputs = session.explained(Inputs.of(recording, None), config, ())
-    return {one.suspect.code: one for one in score_odometry(session.solution_of(visit), inputs)}
+    asked = session.explained(Inputs.of(recording, None), config, ())[2]
+    return {one.suspect.code: one for one in score_odometry(asked)}
 
 
 def state_of(result: SlamResult, name: str) -> float:
@@ -102,7 +101,7 @@ def test_what_is_left_of_a_zero_is_added_to_what_was_undone() -> None:
 
     def under(given: Inputs) -> Any:
         visit = session.solved(given.recording, config, None, ())
-        return SessionSolution(visit, session.solution_of(visit), visit.concluded())
+        return SessionSolution(visit, ScreenedSession(session.solution_of(visit), given), visit.concluded())
 
     found = solve_with_right_turns(inputs, [Taken(TURN_BIAS, 0.022, 1.0)], under, config.slam)
     assert found is not None
@@ -114,9 +113,7 @@ def test_what_is_left_of_a_zero_is_added_to_what_was_undone() -> None:
 
 
 def test_what_is_usual_has_a_prior() -> None:
-    visit, _, inputs = session.explained(Inputs.of(World(seed=1, seconds=10.0).space(), None), Config(), ())
-    solution = session.solution_of(visit)
-    usual = scores._list_usual(solution, Screen.of(optimum_of(solution)), inputs)
+    usual = session.explained(Inputs.of(World(seed=1, seconds=10.0).space(), None), Config(), ())[2].usual
     assert [one.suspect.code for one in usual] == ["odometry-scale", "turn-scale", "turn-bias"]
     wide, narrow = (scores._find_shared(usual, share) for share in (1.0, 0.5))
     sigma = np.array([0.15, 0.15, 0.05])
@@ -160,7 +157,7 @@ def test_turns_are_less_by_a_rate_about_the_axis_of_the_robot() -> None:
 
 
 def test_causes_that_were_undone_are_listed_first() -> None:
-    best: Any = Trial(Inputs.of(World(seconds=2.0).plane(), None), None, (), NAN, 1.0)  # type: ignore[type-var]
+    best: Any = Trial(None, (), NAN, 1.0)  # type: ignore[type-var]
     other = Cause("clock", "sensor", "late", 0.1, 0.01, 1.0, "")
     found = add_put_right(Explained(best, (other,)), Taken(TURN_BIAS, 0.02, 1e6))
     assert [one.code for one in found.causes] == ["turn-bias", "clock"]

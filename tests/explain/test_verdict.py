@@ -307,7 +307,7 @@ def test_a_run_that_is_weak_is_asked_what_it_held(
     monkeypatch.setattr(verdict, "measure_signs", lambda *_: signs)
     monkeypatch.setattr(verdict, "score_session", lambda session, *_: (asked.append(session), scores)[1])
     result: Any = SimpleNamespace(parameters=(), causes=(), trajectory=None)
-    found = verdict.judge(result, recording, SlamConfig(), survey, session=SESSION)
+    found = verdict.judge(result, recording, SlamConfig(), survey, asked=SESSION)
     assert found.kind is kind
     assert asked == ([] if kind is VerdictKind.LOST else [SESSION])
     if kind is VerdictKind.SENSOR_SUSPECT:

@@ -86,14 +86,19 @@ def list_causes(
     """
     if not weighed:
         return ()
-    relative = np.array([trial.beats(best) for trial in weighed])
-    share = np.exp(np.minimum(relative, 0.0))
-    share /= max(float(share.sum()), 1e-300)
     own = [find_own(trial) for trial in weighed]
+    relative = np.array([trial.beats(best) for trial in weighed])
     named = [
-        {(one.suspect.code, one.suspect.subject) for one in trial.taken} | {(one.code, one.subject) for one in scales}
+        frozenset((one.suspect.code, one.suspect.subject) for one in trial.taken)
+        | {(one.code, one.subject) for one in scales}
         for trial, scales in zip(weighed, own, strict=True)
     ]
+    # the same causes are one explanation, however they were found: what has a scale as a state, or was undone
+    likeliest = dict[frozenset[tuple[str, str]], int]()
+    for row in np.argsort(relative, kind="stable").tolist():
+        likeliest[named[row]] = row
+    share = np.where(np.isin(np.arange(len(weighed)), [*likeliest.values()]), np.exp(np.minimum(relative, 0.0)), 0.0)
+    share /= max(float(share.sum()), 1e-300)
 
     def weigh(name: tuple[str, str]) -> tuple[float, str]:
         """Return the probability of a cause, and the words for the best trial without it."""

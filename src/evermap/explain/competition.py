@@ -88,19 +88,20 @@ def explain(
     screens: tuple[Callable[..., Asked], ...] = (screen_plain, screen_continuous)  # what costs nothing first
     if solution is not None:
         symptoms = find_symptoms(solution.result, inputs, config, is_read_well=is_read_well)
-        off = () if symptoms else find_turns_off(solution, inputs)
+        off = () if symptoms else find_turns_off(solution)
         right = solve_with_right_turns(inputs, off, solve_under, config) if off else None
         if right is not None:
             given, now, off = right
             since = explain(given, now, solve_under, config, say, is_read_well=is_read_well, is_suspected=is_suspected)
             return None if since is None else add_put_right(since, *off)
         if not (symptoms or is_suspected):
-            sound = Trial(inputs, solution, (), math.nan, 1.0)
+            sound = Trial(solution, (), math.nan, 1.0)
             return Explained(sound, find_put_right(solution.result, inputs, config))
         few = count_changed(solution.result) <= rules.map_changed * len(solution.result.landmarks)
-        if symptoms in ((CHANGES,), (SINGLE,)) and few and not (is_suspected or find_score(solution, inputs) > 0.0):
-            screens = screens[:1]  # of a landmark or two, and no calibration earns anything
-    base = None if solution is None else weigh_solution(inputs, solution, ())
+        if symptoms in ((CHANGES,), (SINGLE,)) and few and not (is_suspected or find_score(solution) > 0.0):
+            # of a landmark or two, and no calibration earns anything: what is of all has other symptoms
+            screens = (partial(screen_plain, of_some=symptoms == (SINGLE,)),)
+    base = None if solution is None else weigh_solution(solution, ())
     say("the session contradicts what was stated: other causes are asked, which takes a few times as long")
     budget = Budget(rules.most_solutions)
     weighed = [] if base is None else [base]
@@ -108,7 +109,7 @@ def explain(
     for _ in range(rules.most_causes):
         given = inputs if best is None else best.inputs  # what is wrong with the drive bends its shape
         alone = _solve_alone(best, given, solve_under, rules.rejected, budget)
-        shown: tuple[Callable[..., Asked], ...] = (partial(screen_plain, alone=alone), *screens[1:])
+        shown: tuple[Callable[..., Asked], ...] = (partial(screens[0], alone=alone), *screens[1:])
         found = _next_cause(best, inputs, solve_under, config, budget, weighed, shown)
         if found is None:
             break
@@ -301,7 +302,7 @@ def _without_needless(
             undone = given
             for other in rest:
                 undone = other.suspect.undo(undone, other.state)
-            trial = weigh_solution(undone, solve_under(undone), rest)
+            trial = weigh_solution(solve_under(undone), rest)
         except EvermapError:
             continue
         weighed.append(trial)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -32,6 +33,7 @@ from evermap.slam.changes.gain import PLANE, log_onset, log_prior
 from evermap.slam.correlation import Lasting
 from evermap.slam.estimate import Solved
 from evermap.slam.linearise import PlacePriors, detection_residuals
+from evermap.slam.noise import gain_without_start
 from evermap.slam.room import ROOM_M, hold_in_room
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.against_map import log_map_density
@@ -121,7 +123,7 @@ class ScalePrior(NamedTuple):
     of_cause: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Optimum:
     """The graph of a session at its optimum, and what its evidence needs beside it.
 
@@ -132,7 +134,7 @@ class Optimum:
         detections: what these are worth.
         log_priors: logarithms of the densities of all priors but the border's where they are highest, and of the
             odometry's.
-        log_prices: log prior probability of all changes that the solution has.
+        log_prices: log prior probability of all changes that the solution has, but of those that `price_changes` asks.
         worth: share of what detections say that is new, given that errors last.
         scales: numbers of the border that causes are of, too, and what is meant of them.
     """
@@ -146,25 +148,31 @@ class Optimum:
     worth: float
     scales: tuple[ScalePrior, ...] = ()
 
+    @cached_property
+    def solved(self) -> Factorised:
+        """The normal equations there, factorised once for all that is asked of them."""
+        return exhausted(self.graph.factorised(self.now))
+
 
 def log_evidence(session: AnySession, changes: tuple[MapChange, ...] = ()) -> float:
     """Return the log evidence of a solved session, with the prices of the changes that it was told to have [nats]."""
-    return evidence_at(optimum_of(session, changes))
+    return evidence_at(optimum_of(session), price_changes(session, changes))
 
 
-def evidence_at(optimum: Optimum) -> float:
-    """Return the log evidence at an optimum [nats]."""
-    graph, seen = optimum.graph, optimum.detections
+def evidence_at(optimum: Optimum, log_prices: float = 0.0) -> float:
+    """Return the log evidence at an optimum [nats]; `log_prices` is as `price_changes` returns it."""
+    seen = optimum.detections
     fit = float(seen.share @ seen.log_density) - (optimum.now.cost - seen.cost)
-    return fit + optimum.log_priors + optimum.log_prices + log_volume(graph, optimum.now)
+    return fit + optimum.log_priors + (optimum.log_prices + log_prices) + log_volume(optimum)
 
 
-def log_volume(graph: Graph[Any], now: Linear) -> float:
+def log_volume(optimum: Optimum) -> float:
     """Return the logarithm of the volume that the unknowns are left, times the density of the border's prior."""
+    graph = optimum.graph
     information = np.maximum(graph.border.information, LEAST_INFORMATION)  # what jitter seems to say was taken off
     border = 0.5 * float(np.log(information).sum()) - 0.5 * len(information) * LOG_2PI
     count = int(graph.structure.layout.dim.sum())
-    return border + 0.5 * count * LOG_2PI - 0.5 * exhausted(graph.factorised(now)).log_determinant
+    return border + 0.5 * count * LOG_2PI - 0.5 * optimum.solved.log_determinant
 
 
 def price_scales(optimum: Optimum) -> tuple[float, float]:
@@ -177,7 +185,7 @@ def price_scales(optimum: Optimum) -> tuple[float, float]:
     graph, meant, found = optimum.graph, 0.0, 0.0
     if not optimum.scales:
         return meant, found
-    variance = np.diag(np.linalg.inv(exhausted(graph.factorised(optimum.now)).information))
+    variance = np.diag(np.linalg.inv(optimum.solved.information))
     offset, prior = graph.border.offset(optimum.state), graph.border.information
     for row, off, sigma, p_needed, of_cause in optimum.scales:
         free = 1.0 - variance[row] * prior[row]  # share of what is known that is no prior's
@@ -200,17 +208,38 @@ def _log_normal(off: float, variance: float) -> float:
     return -0.5 * (off**2 / variance + math.log(variance) + LOG_2PI)
 
 
+def weigh_levels(session: AnySession) -> float:
+    """Return by how much the log evidence of a solution is larger at noise levels that no start has pulled [nats].
+
+    In the plane, where few steps of odometry say what a level is (`slam.noise.gain_without_start`).
+    """
+    if not isinstance(session, Solved) or not session.settings.estimate_noise:
+        return 0.0
+    outcome, values = session.outcome, session.outcome.graph_estimate
+    inlier = outcome.smoother.inlier_probability(values)
+    start = intake.beliefs(session.recording.sensor, session.settings)[1]
+    return gain_without_start(outcome.problem, values, outcome.fit_marginals, inlier, outcome.noise.noise, start)
+
+
 def used_rows(session: AnySession) -> IntArray:
     """Return (M,) rows of the recording's detections that a session used, in the order of its problem."""
     return session.prepared.used if isinstance(session, Solved) else session.intake.used
 
 
-def optimum_of(session: AnySession, changes: tuple[MapChange, ...] = ()) -> Optimum:
-    """Return the graph of a session at its optimum, with the log prior probability of its changes."""
-    return _in_plane(session, changes) if isinstance(session, Solved) else _in_space(session)
+def optimum_of(session: AnySession) -> Optimum:
+    """Return the graph of a session at its optimum."""
+    return _in_plane(session) if isinstance(session, Solved) else _in_space(session)
 
 
-def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
+def price_changes(session: AnySession, changes: tuple[MapChange, ...]) -> float:
+    """Return the log prior probability of changes that a solution in the plane has; one in space prices its own."""
+    if not isinstance(session, Solved):
+        return 0.0
+    size, table = len(session.outcome.problem.landmark_mean), session.settings.changes
+    return sum(_price(change, size, PLANE, log_prior, table) for change in changes)
+
+
+def _in_plane(solved: Solved) -> Optimum:
     outcome, problem, noise = solved.outcome, solved.outcome.problem, solved.outcome.noise.noise
     state = outcome.graph_estimate
     smoother = outcome.smoother
@@ -237,11 +266,9 @@ def _in_plane(solved: Solved, changes: tuple[MapChange, ...]) -> Optimum:
     held, count, in_room = hold_in_room(graph, n + np.flatnonzero(free))
     log_priors += in_room - 0.5 * count * LOG_2PI
     log_priors -= _in_own_room(state.pose[:, :2], state.landmark[state.known])
-    table = solved.settings.changes
-    prices = sum(_price(change, len(problem.landmark_mean), PLANE, log_prior, table) for change in changes)
     log_priors += _odometry_peak(graph, now, 3, slice(3, 6))
     worth = _worth(smoother.lasting(state), problem.stamp_s[problem.pose_row], problem.landmark_row)
-    return Optimum(held, now, state, seen, log_priors, prices, worth, _scales_in_plane(solved))
+    return Optimum(held, now, state, seen, log_priors, 0.0, worth, _scales_in_plane(solved))
 
 
 def _scales_in_plane(solved: Solved) -> tuple[ScalePrior, ...]:
@@ -395,19 +422,21 @@ class Screen:
     Attributes:
         optimum: the optimum.
         residual, root: as `residuals_of`.
-        solved: its normal equations.
     """
 
     optimum: Optimum
     residual: FloatArray
     root: FloatArray
-    solved: Factorised
 
     @classmethod
     def of(cls, optimum: Optimum) -> Screen:
         """Return the screen of an optimum."""
-        residual, root = residuals_of(optimum.graph, optimum.now)
-        return cls(optimum, residual, root, exhausted(optimum.graph.factorised(optimum.now)))
+        return cls(optimum, *residuals_of(optimum.graph, optimum.now))
+
+    @property
+    def solved(self) -> Factorised:
+        """Return the normal equations of the optimum."""
+        return self.optimum.solved
 
     def of_detections(self, some: BoolArray) -> BoolArray:
         """Return (R,) which rows are of some of the detections (M,)."""

@@ -64,12 +64,12 @@ def solve_at_true_stamps(
     return None if find_late_sensor(now.result, given) is not None else (given, now)
 
 
-def find_turns_off(solution: SessionSolution[VisitT], inputs: Inputs) -> tuple[Taken, ...]:
+def find_turns_off(solution: SessionSolution[VisitT]) -> tuple[Taken, ...]:
     """Return by how much turns of the odometry are off where that is more than is usual of robots, and no state of the
     solution: the zero of its gyroscope, in space also the scale. Poses are right for all that, as far as detections
     hold them; noise levels, and states, have taken it in.
     """
-    found = score_odometry(solution.session, inputs)
+    found = score_odometry(solution.asked)
     return tuple(Taken(one.suspect, one.value, one.sigma**-2) for one in found if is_unusual(one))
 
 
@@ -87,7 +87,7 @@ def solve_with_right_turns(
         now = solve_under(inputs)
     except EvermapError:  # nothing can be estimated then
         return None
-    left = {one.suspect.code: one for one in score_odometry(now.session, inputs)}
+    left = {one.suspect.code: one for one in score_odometry(now.asked)}
     if any(is_unusual(one) for one in left.values()):
         return None
     taken = list[Taken]()

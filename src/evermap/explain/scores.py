@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -35,7 +35,7 @@ from evermap.explain.causes import (
     turn_less,
 )
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
-from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion
+from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion, held_by_map
 from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray, SpatialRecording, Trajectory, is_in_space
 
@@ -121,6 +121,35 @@ class _Usual(NamedTuple):
     pull: float
 
 
+@dataclass(frozen=True)
+class ScreenedSession:
+    """A solved session, with the screen of its optimum, which is made once for all that is asked there.
+
+    Attributes:
+        session: the solution.
+        inputs: of which it is the solution.
+    """
+
+    session: AnySession
+    inputs: Inputs
+
+    @cached_property
+    def screen(self) -> Screen:
+        """The screen of its optimum."""
+        return Screen.of(optimum_of(self.session))
+
+    @cached_property
+    def usual(self) -> list[_Usual]:
+        """What is usual of odometry, at the solution."""
+        return _list_usual(self.session, self.screen, self.inputs)
+
+    @cached_property
+    def held(self) -> ScreenedSession:
+        """The session at the optimum at which all landmarks of the map stand: `held_by_map`."""
+        held = held_by_map(self.session)
+        return self if held is self.session else ScreenedSession(held, self.inputs)
+
+
 @dataclass(frozen=True, slots=True)
 class SessionScores:
     """What a session tells of what was held; nothing where it can't be asked.
@@ -158,34 +187,34 @@ def is_unusual(score: CalibrationScore) -> bool:
     return score.gain > SIGNIFICANT and abs(score.value) > 2.0 * USUAL_SHARE * score.suspect.sigma
 
 
-def score_session(session: AnySession, inputs: Inputs, trajectory: Trajectory) -> SessionScores:
-    """Return what a solved session tells of what it held as stated.
-
-    Args:
-        session: the solution.
-        inputs: of which it is the solution.
-        trajectory: of its result, for how well poses are known.
+def score_session(asked: ScreenedSession, trajectory: Trajectory) -> SessionScores:
+    """Return what a solved session tells of what it held as stated; `trajectory` is of its result, for how well poses
+    are known.
     """
-    dim = inputs.recording.dim
+    dim = asked.inputs.recording.dim
     variance = np.trace(trajectory.covariance[:, :dim, :dim], axis1=1, axis2=2)
     sigma_m = float(np.sqrt(np.median(variance))) if len(variance) else 0.0
     if not sigma_m > 0.0:
         return SessionScores()
     try:
-        screen = Screen.of(optimum_of(session))
-        found = tuple(_score_all(session, screen, inputs, sigma_m))
+        found = tuple(_score_all(asked, sigma_m))
+        optimum = asked.screen.optimum
     except EvermapError:
         return SessionScores()
+    return SessionScores(found, _measure_alternation(optimum), _count_adrift(optimum, _find_pose_row(asked.session)))
+
+
+def _find_pose_row(session: AnySession) -> IntArray:
+    """Return (M,) rows of the poses of the detections that a session used."""
     solved = session.outcome.problem if isinstance(session, Solved) else session.solved.optimum.smoother.problem
-    adrift = _count_adrift(screen.optimum, solved.pose_row)
-    return SessionScores(found, _measure_alternation(screen.optimum), adrift)
+    return solved.pose_row
 
 
-def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: float) -> Iterable[CalibrationScore]:
+def _score_all(asked: ScreenedSession, sigma_m: float) -> Iterable[CalibrationScore]:
     """Yield the step of each calibration, what is usual of odometry marginalised."""
+    session, screen, inputs, usual = asked.session, asked.screen, asked.inputs, asked.usual
     optimum, dim = screen.optimum, inputs.recording.dim
     at = optimum.graph.structure.system.tree.begin[: len(optimum.state.pose), None] + np.arange(dim)
-    usual = _list_usual(session, screen, inputs)
     between, steps = _find_shared(usual, USUAL_SHARE), [one.column.step()[at] for one in usual]
     for suspect in _list_calibrations(inputs):
         if suspect.code == "clock" and _is_delay_estimated(session, inputs, suspect):
@@ -216,22 +245,17 @@ def _score_all(session: AnySession, screen: Screen, inputs: Inputs, sigma_m: flo
         yield CalibrationScore(suspect, value, known**-0.5, gain, shift / sigma_m)
 
 
-def score_odometry(session: AnySession, inputs: Inputs) -> tuple[CalibrationScore, ...]:
+def score_odometry(asked: ScreenedSession) -> tuple[CalibrationScore, ...]:
     """Return the steps of what is off on every robot and no state of the solution, each beside the others: turns, and
     the zero of the gyroscope. Errors of a motion last, so slopes are compared between stretches of the drive.
-
-    Args:
-        session: the solution.
-        inputs: of which it is the solution.
     """
     try:
-        screen = Screen.of(optimum_of(session))
-        usual = [one for one in _list_usual(session, screen, inputs) if not _is_state(session, one.suspect)]
+        usual = [one for one in asked.usual if not _is_state(asked.session, one.suspect)]
     except EvermapError:
         return ()
     if not usual:
         return ()
-    solved = session.outcome.problem if isinstance(session, Solved) else session.solved.optimum.smoother.problem
+    screen = asked.screen
     information = _find_shared(usual, 1.0)
     covariance = np.linalg.inv(information)
     value = -covariance @ [one.pull for one in usual]
@@ -244,27 +268,21 @@ def score_odometry(session: AnySession, inputs: Inputs) -> tuple[CalibrationScor
         gain = 0.5 * best**2 / variance * screen.optimum.worth
         if gain > CHANCE:
             step = screen.follow(screen.column(value @ directions), 1.0) if step is None else step
-            stretches = screen.find_stretches(solved.pose_row, STRETCHES)
+            stretches = screen.find_stretches(_find_pose_row(asked.session), STRETCHES)
             beside = screen.column(covariance[row] @ directions / variance)  # the others at their best beside it
             gain /= max(screen.variance(beside, best, step, stretches) / beside.information_with(beside), 1.0)
         found.append(CalibrationScore(one.suspect, best, variance**0.5, gain, math.nan))
     return tuple(found)
 
 
-def weigh_usual(session: AnySession, optimum: Optimum, inputs: Inputs) -> float:
+def weigh_usual(asked: ScreenedSession) -> float:
     """Return by how much the log evidence of a solution is larger with what is usual of odometry marginalised [nats].
 
     Of what is no state of it, as turns in space: held as stated they would count against a cause that they look like.
     By what is linear at the optimum (MATH.md, section 8).
-
-    Args:
-        session: the solution.
-        optimum: of it.
-        inputs: of which it is the solution.
     """
     try:
-        screen = Screen.of(optimum)
-        usual = [one for one in _list_usual(session, screen, inputs) if not _is_state(session, one.suspect)]
+        usual = [one for one in asked.usual if not _is_state(asked.session, one.suspect)]
     except EvermapError:
         return 0.0
     if not usual:

@@ -13,8 +13,17 @@ from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import CLOCK
 from evermap.explain.causes import LITTLE, MOUNT_M, RARE_P, Inputs, Suspect, rows_of_kind
-from evermap.explain.evidence import AnySession, Screen, SpatialSession, evidence_at, optimum_of, used_rows
-from evermap.explain.linearise import change_by, cost_nearby, gain_by, held_by_map, solve_nearby
+from evermap.explain.evidence import (
+    AnySession,
+    Screen,
+    SpatialSession,
+    evidence_at,
+    optimum_of,
+    price_changes,
+    used_rows,
+)
+from evermap.explain.linearise import change_by, cost_nearby, gain_by, solve_nearby
+from evermap.explain.scores import ScreenedSession
 from evermap.explain.seeds import find_mount, find_scales, find_shape, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes, find_mirrored_part
 from evermap.explain.trial import FEWER, INLIER, NEAR, Asked, Trial, VisitT, count_changed
@@ -62,8 +71,13 @@ def screen_plain(
     suspects: list[Suspect],
     config: SlamConfig,
     alone: SlamResult | None = None,
+    *,
+    of_some: bool = False,
 ) -> list[tuple[float, Suspect, float]]:
-    """Return causes that show without a solution, in one that fails, or in one without the map, `alone`."""
+    """Return causes that show without a solution, in one that fails, or in one without the map, `alone`; `of_some`: of
+    these those of some detections, by what was seen or by the sensor.
+    """
+    suspects = [one for one in suspects if one.rows is not None] if of_some else suspects
     seeds = _by_seeds(best, inputs, suspects, config)
     of_map = _by_shape(alone, inputs, suspects, seeds)
     if of_map is None:
@@ -244,12 +258,12 @@ def screen_continuous(
     """
     if best is None:
         return []
-    session = _without_changes(best)
-    screen = Screen.of(optimum_of(session))
+    asked = _without_changes(best)
+    session, screen = asked.session, asked.screen
     found, of_all = list[tuple[float, Suspect, float]](), None
     # what changes explain, a cause must explain, too
-    with_changes = optimum_of(best.solution.session, best.solution.result.changes)
-    deficit = evidence_at(with_changes) - evidence_at(screen.optimum)
+    own, changes = best.solution.asked, best.solution.result.changes
+    deficit = evidence_at(own.screen.optimum, price_changes(own.session, changes)) - evidence_at(screen.optimum)
     cost = cost_nearby(session)
     symptoms = find_symptoms(best.solution.result, inputs, config)
     of_noise = symptoms == (INNOVATIONS,) and not count_changed(best.solution.result)
@@ -308,16 +322,16 @@ def _find_fit(session: SpatialSession) -> tuple[float, float]:
     return find_mean_square(nis, smoother.problem.dof, inlier), float(np.mean(~inlier))
 
 
-def _without_changes(best: Trial[VisitT]) -> AnySession:
+def _without_changes(best: Trial[VisitT]) -> ScreenedSession:
     """Return the session with all landmarks of the map where it has them, which is what causes are asked of."""
-    session, inputs = best.solution.session, best.inputs
+    asked, session, inputs = best.solution.asked, best.solution.session, best.inputs
     if not isinstance(session, Solved):
-        return held_by_map(session)
+        return asked.held
     assert not is_in_space(inputs.recording)
     if not best.solution.result.changes:
-        return session
+        return asked
     static = session.settings.model_copy(update={"method": "nohyp"})
     try:
-        return solve(inputs.recording, static, prior_map=inputs.prior_map)
+        return ScreenedSession(solve(inputs.recording, static, prior_map=inputs.prior_map), inputs)
     except EvermapError:
-        return session
+        return asked

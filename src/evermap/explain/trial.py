@@ -15,14 +15,14 @@ from evermap.explain.evidence import (
     LOG_2PI,
     AnySession,
     Score,
-    Screen,
     evidence_at,
-    optimum_of,
+    price_changes,
     price_scales,
     used_rows,
+    weigh_levels,
 )
-from evermap.explain.linearise import change_by, held_by_map
-from evermap.explain.scores import score_session, weigh_usual
+from evermap.explain.linearise import change_by
+from evermap.explain.scores import ScreenedSession, score_session, weigh_usual
 from evermap.slam.estimate import Solved
 from evermap.slam.room import ROOM_M
 from evermap.types import Cause, SlamResult
@@ -45,8 +45,18 @@ class SessionSolution(Generic[VisitT]):
     """What a solution of some inputs consists of."""
 
     visit: VisitT
-    session: AnySession
+    asked: ScreenedSession
     result: SlamResult
+
+    @property
+    def session(self) -> AnySession:
+        """Return what was solved."""
+        return self.asked.session
+
+    @property
+    def inputs(self) -> Inputs:
+        """Return what it is the solution of."""
+        return self.asked.inputs
 
 
 @dataclass(frozen=True)
@@ -63,8 +73,7 @@ class Trial(Generic[VisitT]):
     """A solution under some causes.
 
     Attributes:
-        inputs: without what the causes did.
-        solution: of them.
+        solution: of the inputs without what the causes did.
         taken: the causes.
         evidence: log evidence of the measurements as given, with the prices of all causes and changes.
         worth: share of what the measurements say that is new.
@@ -72,13 +81,17 @@ class Trial(Generic[VisitT]):
         log_scales: log prior density of the scales that it found by itself, which no errors that last make less.
     """
 
-    inputs: Inputs
     solution: SessionSolution[VisitT]
     taken: tuple[Taken, ...]
     evidence: float
     worth: float
     noise: float = 1.0
     log_scales: float = 0.0
+
+    @property
+    def inputs(self) -> Inputs:
+        """Return the inputs without what the causes did."""
+        return self.solution.inputs
 
     def beats(self, other: Trial[VisitT]) -> float:
         """Return by how much the evidence is larger, as far as measurements are independent [nats].
@@ -94,7 +107,7 @@ class Trial(Generic[VisitT]):
     @cached_property
     def gain_left(self) -> float:
         """What the calibration that earns most would gain yet, of those that move the poses [nats]."""
-        return find_score(self.solution, self.inputs)
+        return find_score(self.solution)
 
 
 @dataclass(frozen=True)
@@ -122,9 +135,9 @@ Asked: TypeAlias = list[tuple[float, Suspect, float]]
 """Causes with what they gain [nats] and the state that is tried first."""
 
 
-def find_score(solution: SessionSolution[VisitT], inputs: Inputs) -> float:
+def find_score(solution: SessionSolution[VisitT]) -> float:
     """Return what the calibration that earns most would gain, of those that move the poses [nats]; 0 without."""
-    scores = score_session(solution.session, inputs, solution.result.trajectory)
+    scores = score_session(solution.asked, solution.result.trajectory)
     return max((one.gain for one in scores.harmful), default=0.0)
 
 
@@ -159,8 +172,7 @@ def solve_trial(
         return None
     budget.left -= 1
     try:
-        undone = suspect.undo(inputs, state)
-        return weigh_solution(undone, solve_under(undone), (*taken, Taken(suspect, state)))
+        return weigh_solution(solve_under(suspect.undo(inputs, state)), (*taken, Taken(suspect, state)))
     except EvermapError:  # nothing can be estimated under it
         return None
 
@@ -219,11 +231,11 @@ def _find_step(trial: Trial[VisitT], before: Inputs) -> Score | None:
     """Return what the state of the last cause of a trial does with the map as given, or with what was let go of it:
     of either, what knows more of it; None if it changes what is used.
     """
-    last, session = trial.taken[-1], trial.solution.session
-    held, known, found = held_by_map(session), last.suspect.sigma**-2, list[Score]()
-    for asked in (session,) if held is session else (held, session):
-        screen = Screen.of(optimum_of(asked))
-        direction = change_by(asked, screen, trial.inputs, last.suspect, given=before, state=last.state)
+    last, own = trial.taken[-1], trial.solution.asked
+    known, found = last.suspect.sigma**-2, list[Score]()
+    for asked in (own,) if own.held is own else (own.held, own):
+        screen = asked.screen
+        direction = change_by(asked.session, screen, trial.inputs, last.suspect, given=before, state=last.state)
         if direction is not None:
             score = screen.score(direction, known, last.state)
             found.append(score._replace(information=known + (score.information - known) * screen.optimum.worth))
@@ -250,10 +262,9 @@ def _state_evidence(taken: Taken) -> float:
     )
 
 
-def weigh_solution(inputs: Inputs, solution: SessionSolution[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
+def weigh_solution(solution: SessionSolution[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
     """Return the trial of a solution: the log evidence of what was measured, as given, with the prices of causes."""
-    session = solution.session
-    optimum = optimum_of(session, solution.result.changes)
+    session, inputs, optimum = solution.session, solution.inputs, solution.asked.screen.optimum
     used = used_rows(session)
     if isinstance(session, Solved):
         places = 0
@@ -265,11 +276,12 @@ def weigh_solution(inputs: Inputs, solution: SessionSolution[VisitT], taken: tup
     left_out = len(inputs.stretched) - len(used)
     seen = optimum.detections
     outlier = float(np.mean(np.where(np.isfinite(seen.log_odds), seen.log_nominal - seen.log_odds, 0.0)))
-    evidence = evidence_at(optimum) + volume + left_out * outlier
+    prices = price_changes(session, solution.result.changes)
+    evidence = evidence_at(optimum, prices) + volume + left_out * outlier
     # a map that what was seen lies nowhere on has its places anywhere
     anywhere = inputs.left_out if solution.result.trajectory.frame == "prior_map" else inputs.left_out + inputs.n_common
     evidence -= anywhere * inputs.recording.dim * (math.log(ROOM_M) + 0.5 * LOG_2PI)
     noise = max((one.value for one in solution.result.parameters if one.name.endswith(OF_NOISE[0])), default=1.0)
     meant, found = price_scales(optimum)
-    evidence += meant - found + weigh_usual(session, optimum, inputs) + sum(map(_state_evidence, taken))
-    return Trial(inputs, solution, taken, evidence, optimum.worth, noise, meant)
+    evidence += meant - found + weigh_usual(solution.asked) + weigh_levels(session) + sum(map(_state_evidence, taken))
+    return Trial(solution, taken, evidence, optimum.worth, noise, meant)

@@ -14,9 +14,7 @@ from math import inf, isfinite, isnan, log
 
 from evermap.config import SlamConfig
 from evermap.explain.answer import OWN_STATES
-from evermap.explain.causes import Inputs
-from evermap.explain.evidence import AnySession
-from evermap.explain.scores import MOST_SHIFT, score_session
+from evermap.explain.scores import MOST_SHIFT, ScreenedSession, score_session
 from evermap.explain.symptoms import Signs, measure_signs, with_scores
 from evermap.slam.calibration import far_off
 from evermap.slam.mistakes import Finding
@@ -219,12 +217,12 @@ def with_verdict(
     findings: Sequence[Finding] = (),
     set_aside: str = "",
     as_read: AnyRecording | None = None,
-    session: AnySession | None = None,
+    asked: ScreenedSession | None = None,
 ) -> SlamResult:
     """Return the result with its verdict; arguments as of `judge`."""
     verdict = judge(
         result, recording, settings, prior_map,
-        findings=findings, set_aside=set_aside, as_read=as_read, session=session,
+        findings=findings, set_aside=set_aside, as_read=as_read, asked=asked,
     )  # fmt: skip
     return replace(result, verdict=verdict)
 
@@ -238,7 +236,7 @@ def judge(
     findings: Sequence[Finding] = (),
     set_aside: str = "",
     as_read: AnyRecording | None = None,
-    session: AnySession | None = None,
+    asked: ScreenedSession | None = None,
 ) -> Verdict:
     """Return how far a run can be trusted.
 
@@ -250,16 +248,16 @@ def judge(
         findings: what `slam.check` found odd about the readings alone.
         set_aside: why a session could not be localised in its map; '' where it was, or there is none.
         as_read: the recording with the identities that it was read with; None where they are the same.
-        session: the solution that the result is of. If all else is sound or weak, it is asked what it held as stated:
+        asked: the solution that the result is of. If all else is sound or weak, it is asked what it held as stated:
             what makes a run weak, lengths that contradict each other, may be what that does.
     """
     signs = measure_signs(result, recording, prior_map, as_read)
     wrong = [finding.message for finding in findings if not finding.usable]
     suspicions = [*wrong, *far_off(_without_doubtful(result), settings.check)]
     found = judge_signs(signs, suspicions, result.causes, set_aside)
-    if found.kind not in (VerdictKind.SOUND, WEAK) or session is None:
+    if found.kind not in (VerdictKind.SOUND, WEAK) or asked is None:
         return found
-    scores = score_session(session, Inputs.of(recording, prior_map), result.trajectory)
+    scores = score_session(asked, result.trajectory)
     return judge_signs(with_scores(signs, scores), suspicions, result.causes, set_aside)
 
 

@@ -83,11 +83,7 @@ def refine_noise(
     `estimate` is the optimum under `noise`, with its covariances and the inlier probabilities (M,); `start` are levels
     that `start.pseudo_count` imaginary residuals vouch for.
     """
-    pseudo, residual = start.pseudo_count, detection_residuals(problem, estimate)
-    residual = residual if problem.noise_shape is None else residual / problem.noise_shape
-    learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
-    left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
-    squares, counts = (learned * residual**2).sum(axis=0), (learned * np.maximum(left, 0.0)).sum(axis=0)
+    pseudo, (squares, counts) = start.pseudo_count, _sum_detections(problem, estimate, marginals, weights)
     detection = restricted_level(squares, counts, start.detection, pseudo)
     driven = problem.drive.between(problem.stamp_s, estimate.states)
     pulls, chances, fisher = _odometry_sums(
@@ -118,6 +114,42 @@ def refine_noise(
         np.sqrt(inflation / (2.0 * (count + pseudo))),
         float(np.sqrt(max(of_motions, of_readings))),
     )
+
+
+def _sum_detections(
+    problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return (2,) sums of squares of ranges and bearings that state no noise, and (2,) their degrees of freedom."""
+    residual = detection_residuals(problem, estimate)
+    residual = residual if problem.noise_shape is None else residual / problem.noise_shape
+    learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
+    left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
+    return (learned * residual**2).sum(axis=0), (learned * np.maximum(left, 0.0)).sum(axis=0)
+
+
+def gain_without_start(
+    problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray, noise: Noise, start: Noise
+) -> float:
+    """Return by how much the log evidence is larger at levels that no imagined residuals have pulled [nats].
+
+    What is imagined has noise in metres, and pulls less the nearer a level is to it: so of two solutions that differ in
+    their metre alone, that in which lengths are longer would fit better. By a step of Fisher's scoring from where the
+    pull and the slope of the likelihood are in balance; a slope of more than twice the pull is of levels that are not.
+
+    Arguments are those of `refine_noise`.
+    """
+    squares, counts = _sum_detections(problem, estimate, marginals, weights)
+    driven, variance = problem.drive.between(problem.stamp_s, estimate.states), noise.odometry**2
+    pulls, chances, fisher = _odometry_sums(
+        estimate.pose, driven, variance, problem.prior.free, marginals.explained_odometry
+    )
+    most = start.pseudo_count * np.abs(start.levels**2 / noise.levels**2 - 1.0)
+    slope = 0.5 * np.concatenate([squares / noise.detection**2 - counts, variance * (pulls - chances)])
+    slope = np.clip(slope, -most, most)
+    information = np.diag(0.5 * np.concatenate([counts, np.zeros(len(variance))]))
+    information[len(counts) :, len(counts) :] = variance[:, None] * fisher * variance
+    information += 0.5 * start.pseudo_count * np.eye(len(slope))  # as many, at the levels there are
+    return float(0.5 * slope @ np.linalg.solve(information, slope))
 
 
 def learn_noise_by_range(

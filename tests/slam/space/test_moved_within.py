@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -162,15 +163,35 @@ def test_others_are_asked_where_none_of_the_likeliest_is_at_two_places(monkeypat
     """What moved bends the poses beside it, so that tags that stand there have the outliers."""
     asked = []
 
-    def find(_optimum, suspects, _interval):
+    def find(_optimum, suspects, _interval, single):
         asked.append(suspects.tolist())
-        return suspects if 6 in suspects else None
+        return (suspects, single) if 6 in suspects else (None, single | {*suspects.tolist()})
 
     monkeypatch.setattr(moved_within, "_find_among", find)
-    found = moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8, 6, 3, 5]), 0.95)
+    found, single = moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8, 6, 3, 5]), 0.95)
     assert asked == [[4, 1, 0, 2], [8, 6, 3, 5]]
     assert found.tolist() == asked[1]
-    assert moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8]), 0.95) is None
+    assert single == {4, 1, 0, 2}
+    assert moved_within.find_two_places(None, np.array([4, 1, 0, 2, 8]), 0.95) == (None, {4, 1, 0, 2, 8})
+
+
+def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
+    """Beside the same others, or with those that are asked now left out."""
+    asked, left_out = [], []
+
+    def ask(_optimum, _free, _at, row, _interval):
+        asked.append(row)
+
+    monkeypatch.setattr(moved_within, "_without", lambda _, suspects: left_out.append(suspects.tolist()))
+    monkeypatch.setattr(moved_within, "as_seen", lambda *_: None)
+    monkeypatch.setattr(moved_within, "_at_two_places", ask)
+    optimum = SimpleNamespace(smoother=SimpleNamespace(problem=SimpleNamespace(measured=None)))
+    _, single = moved_within.find_two_places(optimum, np.array([4, 1, 0, 2, 8]), 0.95, frozenset({1}))
+    assert asked == [4, 0, 2, 8]
+    found = moved_within.find_two_places(optimum, np.array([4, 1, 0, 2, 8, 7]), 0.95, single)
+    assert found == (None, {4, 1, 0, 2, 8, 7})
+    assert asked == [4, 0, 2, 8, 7]
+    assert left_out == [[4, 1, 0, 2], [8], [8, 7]]
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from evermap.explain.answer import in_given_units
 from evermap.explain.causes import Inputs
 from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
+from evermap.explain.scores import ScreenedSession
 from evermap.explain.trial import SessionSolution
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
@@ -433,8 +434,9 @@ def explained(
     progress: Progress | None = None,
     is_read_well: bool = False,
     is_suspected: bool = False,
-) -> tuple[Visit, SlamResult, Inputs]:
-    """Return a session solved, its result, and what that is of: as given, or under the causes that explain it better
+    solution: SessionSolution[Visit] | None = None,
+) -> tuple[Visit, SlamResult, ScreenedSession]:
+    """Return a session solved, its result, and its screen: as given, or under the causes that explain it better
     (`explain`).
 
     Args:
@@ -445,6 +447,7 @@ def explained(
         progress: the same.
         is_read_well: whether pairs of sightings are known to show no mistake.
         is_suspected: whether scores say that a calibration is not as stated.
+        solution: of the inputs as given, where it is known.
 
     Raises:
         DataError, NumericalError: as of `run_slam`.
@@ -459,11 +462,11 @@ def explained(
         result = visit.concluded()
         if not np.isfinite(result.trajectory.pose_world_robot).all():
             raise NumericalError("the solution has poses that are no numbers", hint="check units, mounts and stamps")
-        return SessionSolution(visit, solution_of(visit), result)
+        return SessionSolution(visit, ScreenedSession(solution_of(visit), given), result)
 
     told = list[str]()
     try:
-        as_given = under(inputs, realtime=realtime, progress=progress)
+        as_given = solution or under(inputs, realtime=realtime, progress=progress)
     except (DataError, NumericalError):
         found = None
         if config.slam.explain.on:
@@ -472,15 +475,15 @@ def explained(
             raise
     else:
         if not config.slam.explain.on or as_given.result.interrupted or realtime:
-            return as_given.visit, as_given.result, inputs
+            return as_given.visit, as_given.result, as_given.asked
         found = explain(
             inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well, is_suspected=is_suspected
         )
         assert found is not None
     best = found.best.solution
     if not found.causes:
-        return best.visit, best.result, inputs
-    return best.visit, replace(in_given_units(found.best), causes=found.causes), found.best.inputs
+        return best.visit, best.result, best.asked
+    return best.visit, replace(in_given_units(found.best), causes=found.causes), best.asked
 
 
 def solution_of(visit: Visit) -> AnySession:

@@ -63,12 +63,13 @@ def explain_places(
     begun, of_bodies = optimum, len(identity)
     found = _explain_with(begun, identity, (), whole, stated, changes, of_bodies)
     asked, interval = ~whole, (changes or ChangesConfig()).interval
-    gain_nats = optimum.smoother.problem.settings.repair.gain_nats
+    gain_nats, single = optimum.smoother.problem.settings.repair.gain_nats, frozenset[int]()
     for _ in range(ROUNDS):
         if _contradicts_map(found):
             break
         suspects = list_movers(found.optimum, found.identity, asked, _off_map(found))
-        if not len(suspects) or (two := find_two_places(begun, suspects, interval)) is None:
+        two, single = find_two_places(begun, suspects, interval, single)
+        if two is None:
             break
         landmark, larger = int(identity[two.before]), np.append(identity, identity[two.before])
         asked = asked & (np.arange(len(asked)) != landmark)
@@ -88,7 +89,7 @@ def explain_places(
             if is_one:
                 probability = 1.0 / (1.0 + math.exp(-min(nats, two.nats)))
                 trial = replace(trial, moves=(*found.moves, move._replace(probability=probability)))
-            found, begun, identity = trial, two.optimum, larger
+            found, begun, identity, single = trial, two.optimum, larger, frozenset()
     stood = [move for move in found.moves if not has_moved(found.optimum, move)]
     if not stood:
         return found

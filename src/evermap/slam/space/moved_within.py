@@ -160,27 +160,46 @@ def _odd_sightings(optimum: SpatialOptimum, identity: IntArray) -> BoolArray:
     return odd
 
 
-def find_two_places(optimum: SpatialOptimum, suspects: IntArray, interval: float) -> TwoPlaces | None:
-    """Return the most probable solution in which one of some landmarks is at two places in turn; None without any.
+def find_two_places(
+    optimum: SpatialOptimum, suspects: IntArray, interval: float, single: frozenset[int] = frozenset()
+) -> tuple[TwoPlaces | None, frozenset[int]]:
+    """Return the most probable solution in which one of some landmarks is at two places in turn, None without any; and
+    the rows that are known to be at one place then.
 
     Args:
         optimum: before landmarks were split.
         suspects: rows of places, the likeliest first: the next few are asked where none of those before them is.
         interval: probability of the interval in which the change is reported.
+        single: rows that are known to be at one place of this optimum.
     """
-    turns = (suspects[first : first + MOST_SUSPECTS] for first in range(0, len(suspects), MOST_SUSPECTS))
-    return next((two for some in turns if (two := _find_among(optimum, some, interval)) is not None), None)
+    for first in range(0, len(suspects), MOST_SUSPECTS):
+        two, single = _find_among(optimum, suspects[first : first + MOST_SUSPECTS], interval, single)
+        if two is not None:
+            return two, single
+    return None, single
 
 
-def _find_among(optimum: SpatialOptimum, suspects: IntArray, interval: float) -> TwoPlaces | None:
+def _find_among(
+    optimum: SpatialOptimum, suspects: IntArray, interval: float, single: frozenset[int]
+) -> tuple[TwoPlaces | None, frozenset[int]]:
+    asked = [row for row in suspects.tolist() if row not in single]
+    if not asked:
+        return None, single
     free = _without(optimum, suspects)
     at = as_seen(optimum.smoother.problem, free, optimum.smoother.problem.measured)
-    found = [two for row in suspects.tolist() if (two := _at_two_places(optimum, free, at, row, interval)) is not None]
+    found = list[TwoPlaces]()
+    for row in asked:
+        two = _at_two_places(optimum, free, at, row, interval)
+        if two is None:
+            single |= {row}
+        else:
+            found.append(two)
     if not found:
-        return None
+        return None, single
     best = min(found, key=lambda two: two.optimum.now.cost)
     better = repaired(converged(best.optimum.smoother.problem, best.optimum.estimate, optimum.noise, heavy_rounds=0))
-    return best._replace(optimum=better, nats=_nats_of_looks(better, best.before, best.after, best.since_s))
+    nats = _nats_of_looks(better, best.before, best.after, best.since_s)
+    return best._replace(optimum=better, nats=nats), single
 
 
 def _at_two_places(
