@@ -14,7 +14,7 @@ from evermap.errors import ConfigError, DataError, InputError
 from evermap.types import AnyRecording, IntArray, Landmarks, Progress, Recording, SlamResult, is_in_space
 
 if TYPE_CHECKING:
-    from evermap.explain.causes import Inputs
+    from evermap.explain.causes.suspect import Inputs
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.placing import Localised
     from evermap.maps.sessions.planar import PlanarVisit
@@ -49,7 +49,7 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.explain.carried import Carried, find_carried, name_carried
-    from evermap.explain.causes import Inputs
+    from evermap.explain.causes.suspect import Inputs
     from evermap.explain.faults import with_mended
     from evermap.explain.trial import SessionSolution
     from evermap.explain.verdict import with_verdict

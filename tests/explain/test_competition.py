@@ -11,7 +11,8 @@ import pytest
 from evermap import run_session, run_slam
 from evermap.config import Config
 from evermap.errors import NumericalError
-from evermap.explain.causes import Inputs, Suspect, list_suspects
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
 from evermap.explain.scores import ScreenedSession
 from evermap.explain.screens import screen_pairs

@@ -15,7 +15,7 @@ from evermap.config.slam import NoiseConfig
 from evermap.estimate.graph import Border, Graph, Layout, Room, build_structure, grouped
 from evermap.estimate.sparse.system import exhausted
 from evermap.explain import scores
-from evermap.explain.causes import USUAL_P, Suspect
+from evermap.explain.causes.suspect import USUAL_P, Suspect
 from evermap.explain.evidence import (
     LOG_2PI,
     DetectionTerms,

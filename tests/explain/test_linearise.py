@@ -10,7 +10,8 @@ import pytest
 
 from evermap.config import Config
 from evermap.estimate.sparse.system import exhausted
-from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.suspect import Inputs
 from evermap.explain.evidence import residuals_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by, change_by_motion
 from evermap.maps.sessions import session

@@ -14,7 +14,7 @@ from evermap import run_slam
 from evermap.config import Config, SlamConfig
 from evermap.explain import competition, screens, seeds, triggers
 from evermap.explain.answer import list_causes
-from evermap.explain.causes import Inputs, Suspect
+from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.evidence import Score, weigh_levels
 from evermap.explain.screens import FAR
 from evermap.explain.trial import (

@@ -14,7 +14,8 @@ import pytest
 from evermap import run_slam
 from evermap.config import Config
 from evermap.explain import scores
-from evermap.explain.causes import Inputs, list_suspects
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.suspect import Inputs
 from evermap.explain.scores import DRIFT, SIGNIFICANT, CalibrationScore, SessionScores, _count_adrift, score_session
 from evermap.explain.symptoms import Signs, with_scores
 from evermap.explain.verdict import judge_signs

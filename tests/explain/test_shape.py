@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap.config import SlamConfig
-from evermap.explain.causes import Inputs, Suspect, list_suspects
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.competition import _rank
 from evermap.explain.put_right import find_put_right
 from evermap.explain.screens import _by_shape

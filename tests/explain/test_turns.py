@@ -11,7 +11,8 @@ import pytest
 from evermap import run_slam
 from evermap.config import Config
 from evermap.explain import scores
-from evermap.explain.causes import Inputs, turn_less
+from evermap.explain.causes.odometry import turn_less
+from evermap.explain.causes.suspect import Inputs
 from evermap.explain.put_right import add_put_right, solve_with_right_turns
 from evermap.explain.scores import TURN_BIAS, ScreenedSession, is_unusual, score_odometry
 from evermap.explain.symptoms import Signs

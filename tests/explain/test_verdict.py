@@ -15,7 +15,7 @@ import pytest
 from evermap import run_slam
 from evermap.config import SlamConfig
 from evermap.explain import verdict
-from evermap.explain.causes import Suspect
+from evermap.explain.causes.suspect import Suspect
 from evermap.explain.scores import CalibrationScore, SessionScores
 from evermap.explain.symptoms import Signs, measure_signs
 from evermap.explain.verdict import LIMITS, SURE, Limit, judge_signs

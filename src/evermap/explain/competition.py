@@ -16,7 +16,8 @@ from functools import partial
 from evermap.config import SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import list_causes
-from evermap.explain.causes import Inputs, Suspect, list_suspects
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.put_right import (
     add_late_sensor,
     add_put_right,

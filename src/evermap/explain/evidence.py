@@ -8,7 +8,7 @@ that neither a wider noise nor fewer detections come for nothing. Landmarks of w
 within a room (`slam.room`). Odometry says where the robot goes, given what was driven: its density is that of motions,
 whatever its scale, as one of velocities would be the larger the longer the drive is said to be. Solutions of the same
 measurements can be compared, also where the measurements were transformed, if the volume of the transformation is
-counted (`causes.Inputs`).
+counted (`causes.suspect.Inputs`).
 
 **Score.** A further number changes all residuals by a known direction `d`. With everything else marginalised, the
 information on it is `h = d'd - b'H^-1 b`, `b = J'd`, and the cost falls by `g^2 / 2 h` at `-g / h`, with
@@ -26,7 +26,8 @@ import numpy as np
 
 from evermap.estimate.graph import Graph, Linear
 from evermap.estimate.sparse.system import Factorised, exhausted
-from evermap.explain.causes import SCALE, TURN, USUAL_P
+from evermap.explain.causes.odometry import TURN
+from evermap.explain.causes.suspect import SCALE, USUAL_P
 from evermap.slam import intake
 from evermap.slam.calibration import FORWARD, SLOPE
 from evermap.slam.changes.gain import PLANE, log_onset, log_prior

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.errors import EvermapError
 from evermap.estimate.sparse.system import exhausted
-from evermap.explain.causes import Inputs, Suspect
+from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Optimum, Screen, SpatialSession, residuals_of
 from evermap.geometry import se2, se3
 from evermap.slam.calibration import DELAY

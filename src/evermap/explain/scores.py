@@ -22,18 +22,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from evermap.errors import EvermapError
-from evermap.explain.causes import (
-    CLOCK_RATE,
-    DELAY_S,
-    FOCAL,
-    LITTLE,
-    RARE_P,
-    USUAL_P,
-    Inputs,
-    Suspect,
-    list_suspects,
-    turn_less,
-)
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.lenses import FOCAL
+from evermap.explain.causes.odometry import DELAY_S, turn_less
+from evermap.explain.causes.suspect import LITTLE, RARE_P, USUAL_P, Inputs, Suspect
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
 from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion, held_by_map
 from evermap.slam.estimate import Solved
@@ -51,6 +43,9 @@ OF_MOTION = USUAL | {"clock", "clock-drift"}
 """What changes residuals by how the robot moved."""
 USUAL_SHARE = 0.13
 """Standard deviation of these, where all is well, over that beforehand: 2 % of a scale, .4 deg/s of a gyroscope."""
+CLOCK_RATE = 0.005
+"""Standard deviation of how much faster one clock runs than another, where they do at all; a tenth of it is as fast as
+a clock is slewed that is set by another over a network. Crystals differ by less."""
 STRETCHES = 8
 """Parts of a drive by which slopes along them are compared."""
 OF_LENGTHS = frozenset({"range-scale", "tag-size", "map-scale"})

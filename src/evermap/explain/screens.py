@@ -12,7 +12,8 @@ import numpy as np
 from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import CLOCK
-from evermap.explain.causes import LITTLE, MOUNT_M, RARE_P, Inputs, Suspect, rows_of_kind
+from evermap.explain.causes.mounts import MOUNT_M
+from evermap.explain.causes.suspect import LITTLE, RARE_P, Inputs, Suspect, rows_of_kind
 from evermap.explain.evidence import (
     AnySession,
     Screen,

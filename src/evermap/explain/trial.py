@@ -10,7 +10,7 @@ from typing import Generic, Protocol, TypeAlias, TypeVar
 import numpy as np
 
 from evermap.errors import EvermapError
-from evermap.explain.causes import Inputs, Suspect
+from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.evidence import (
     LOG_2PI,
     AnySession,

@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 from evermap.config import SlamConfig
-from evermap.explain.causes import MOUNT_M, Inputs, has_scale
+from evermap.explain.causes.mounts import MOUNT_M
+from evermap.explain.causes.sizes import has_scale
+from evermap.explain.causes.suspect import Inputs
 from evermap.explain.seeds import find_mount, find_sensor_scales, find_single_scales
 from evermap.explain.symptoms import compare_odometry
 from evermap.explain.trial import INLIER, OF_NOISE, share_rejected

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.config import Config
-from evermap.explain.causes import Inputs
+from evermap.explain.causes.suspect import Inputs
 from evermap.explain.scores import score_session
 from evermap.maps.sessions import session
 from evermap.pipeline import run_slam

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap import run_slam
-from evermap.explain.causes import has_scale
+from evermap.explain.causes.sizes import has_scale
 from evermap.explain.seeds import find_sensor_scales
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import VerdictKind

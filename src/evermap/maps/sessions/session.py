@@ -12,7 +12,7 @@ from evermap.config import Config, LivingConfig
 from evermap.errors import DataError, NumericalError
 from evermap.existence.sites import Evidence
 from evermap.explain.answer import in_given_units
-from evermap.explain.causes import Inputs
+from evermap.explain.causes.suspect import Inputs
 from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
 from evermap.explain.scores import ScreenedSession
