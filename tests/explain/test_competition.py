@@ -25,7 +25,7 @@ from evermap.maps.sessions import session
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.session import Visit
 from evermap.slam.clocks import find_delay
-from evermap.slam.mistakes import USUAL, pairs_of
+from evermap.slam.pairs import USUAL, pairs_of
 from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
 
 from .worlds import SIZE_M, World

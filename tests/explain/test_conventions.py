@@ -16,8 +16,10 @@ from evermap.explain.shape import compare_shapes, find_mirrored_part
 from evermap.io.spatial import with_tag_poses
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.check import find_corner_mistake, is_clockwise, read_corners
-from evermap.slam.mistakes import USUAL, Mistake, find_motion, read_drive
+from evermap.slam.mistake_search import find_motion
+from evermap.slam.mistakes import Mistake
 from evermap.slam.orientations import find_convention
+from evermap.slam.pairs import USUAL, read_drive
 from evermap.types import FloatArray, Landmarks, Recording, SensorKind, SpatialRecording, VerdictKind
 from evermap_studies.causes.catalogue import catalogue
 from evermap_studies.causes.drives import as_recording

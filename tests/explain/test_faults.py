@@ -12,7 +12,8 @@ from evermap import check_recording, run_slam
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
 from evermap.slam.gaps import find_gaps
-from evermap.slam.mistakes import USUAL, find_silences, without_silences
+from evermap.slam.pairs import USUAL
+from evermap.slam.silences import find_silences, without_silences
 from evermap.types import AnyRecording, SlamResult, VerdictKind
 
 from .worlds import World

@@ -12,7 +12,8 @@ import pytest
 from evermap import Config, check_recording, run_localization, run_session, run_slam
 from evermap.geometry import se3
 from evermap.slam.check import RIDER, leave_out_riders
-from evermap.slam.mistakes import USUAL, find_riders
+from evermap.slam.pairs import USUAL
+from evermap.slam.riders import find_riders
 from evermap.types import VerdictKind, rows_of
 
 from .worlds import World

@@ -15,9 +15,9 @@ import pytest
 from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
-from evermap.slam import mistakes as mistakes_of
+from evermap.slam import mistake_search
 from evermap.slam.calibration import SPECS, far_off
-from evermap.slam.mistakes import USUAL
+from evermap.slam.pairs import USUAL
 from evermap.types import UNKNOWN, Detections, Frames, Odometry, ParameterEstimate, Recording, VerdictKind, rows_of
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -95,8 +95,8 @@ def test_what_a_share_of_the_pairs_rules_out_would_not_have_been_told(
         ruled_out.append(len(candidates) - len(possible(pairs, candidates, *given)))
         return candidates
 
-    fast, possible = raw_check(recording), mistakes_of._possible
-    monkeypatch.setattr(mistakes_of, "_possible", everything)
+    fast, possible = raw_check(recording), mistake_search._possible
+    monkeypatch.setattr(mistake_search, "_possible", everything)
     assert raw_check(recording) == fast
     assert name is not None or max(ruled_out) > 50
 

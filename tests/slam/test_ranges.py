@@ -20,8 +20,8 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.io import write_native
 from evermap.pipeline import run_localization
-from evermap.slam.mistakes import find_silences
 from evermap.slam.ranges import has_range_changed, with_bearings, with_bearings_anew
+from evermap.slam.silences import find_silences
 from evermap.types import (
     UNKNOWN,
     ChangeKind,

@@ -40,8 +40,8 @@ from evermap.explain.triggers import (
 )
 from evermap.slam.clocks import FALLS, find_delay, find_pair_loss, late_by
 from evermap.slam.estimate import Solved, solve
-from evermap.slam.mistakes import pairs_of
 from evermap.slam.orientations import MIRRORED
+from evermap.slam.pairs import pairs_of
 from evermap.types import FloatArray, IntArray, SlamResult, is_in_space
 
 FAR = 2.5

@@ -20,7 +20,9 @@ from evermap.config import CheckConfig
 from evermap.estimate.tie import find_nearest
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import FALLS, find_pair_loss
-from evermap.slam.mistakes import HONEST, Mistake, find_motion, off, pairs_of
+from evermap.slam.mistake_search import find_motion
+from evermap.slam.mistakes import HONEST, Mistake
+from evermap.slam.pairs import off, pairs_of
 from evermap.types import (
     UNKNOWN,
     AnyRecording,

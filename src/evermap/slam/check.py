@@ -1,8 +1,8 @@
 """Problems of a recording, found before anything is estimated: units, signs, clocks, identities, limits.
 
-**Units, signs and clocks** show in whether landmarks stand still (`slam.mistakes`); a second mistake is looked for when
-the first is undone. Honest recordings err by metres in a hundred and by tenths of a second: no mistake on the list is
-near enough to be mistaken for that.
+**Units, signs and clocks** show in whether landmarks stand still (`slam.mistake_search`); a second mistake is looked
+for when the first is undone. Honest recordings err by metres in a hundred and by tenths of a second: no mistake on the
+list is near enough to be mistaken for that.
 
 **Identities, limits, gaps, jumps of the odometry** are counted.
 """
@@ -22,19 +22,12 @@ from evermap.geometry.square import with_square_poses
 from evermap.show import Shown
 from evermap.slam.cleaning import clean
 from evermap.slam.gaps import find_spikes
-from evermap.slam.mistakes import (
-    HONEST,
-    USUAL,
-    Finding,
-    find_motion,
-    find_riders,
-    find_silences,
-    off,
-    pairs_of,
-    without_riders,
-    without_silences,
-)
+from evermap.slam.mistake_search import find_motion
+from evermap.slam.mistakes import HONEST, Finding
 from evermap.slam.orientations import find_convention
+from evermap.slam.pairs import USUAL, off, pairs_of
+from evermap.slam.riders import find_riders, without_riders
+from evermap.slam.silences import find_silences, without_silences
 from evermap.types import (
     UNKNOWN,
     AnyRecording,

@@ -13,8 +13,8 @@ import numpy as np
 
 from evermap.config import CleaningConfig
 from evermap.errors import DataError
+from evermap.slam.clocks import LEAST_STEP_S, clock_steps
 from evermap.slam.gaps import find_running_median, find_spikes
-from evermap.slam.mistakes import LEAST_STEP_S, clock_steps
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 from evermap.valid import LATEST_S
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se3
-from evermap.slam.mistakes import CONVENTIONS, Mistake, sighting_pairs
+from evermap.slam.mistakes import CONVENTIONS, Mistake
+from evermap.slam.pairs import sighting_pairs
 from evermap.types import AnyRecordingT, BoolArray, FloatArray, SpatialRecording, is_in_space
 
 SAME = 1e-6

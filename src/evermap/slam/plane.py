@@ -22,8 +22,10 @@ from evermap.errors import ConfigError
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import are_of_several_clocks
-from evermap.slam.mistakes import find_riders, sighting_pairs, unusable, without_riders
+from evermap.slam.mistake_search import unusable
 from evermap.slam.orientations import find_convention, without_unmeasured
+from evermap.slam.pairs import sighting_pairs
+from evermap.slam.riders import find_riders, without_riders
 from evermap.slam.space.intake import positions_of, without_range
 from evermap.types import (
     AnyRecording,

@@ -14,6 +14,7 @@ from evermap.explain.causes.suspect import RARE_P, SCALE, USUAL_P, Inputs, Suspe
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
 from evermap.slam import mistakes
+from evermap.slam.pairs import read_drive
 from evermap.types import FloatArray, SpatialOdometry, SpatialRecording, is_in_space
 
 TURN = 0.15
@@ -126,7 +127,7 @@ def _drives_sideways(odometry: SpatialOdometry) -> bool:
 def _read_drive(inputs: Inputs, _: float, mistake: mistakes.Mistake) -> Inputs:
     """Return the same with the odometry's signs and axes read in another way."""
     recording: Any = inputs.recording
-    return _with_poses(inputs, mistakes.read_drive(recording.odometry.pose_world_robot, *mistake.drive))
+    return _with_poses(inputs, read_drive(recording.odometry.pose_world_robot, *mistake.drive))
 
 
 def _read_poses(inputs: Inputs, _: float, convention: str) -> Inputs:

@@ -36,6 +36,7 @@ from evermap.explain.causes.suspect import (
 from evermap.slam import mistakes
 from evermap.slam.check import CLOCKWISE, CORNERS, SIGHTED, find_corner_mistake, is_clockwise, read_corners
 from evermap.slam.orientations import find_convention
+from evermap.slam.pairs import USUAL
 from evermap.types import SpatialRecording
 
 
@@ -110,7 +111,7 @@ def _suspect_conventions(recording: SpatialRecording) -> Iterable[Suspect]:
             "corner-order", "corners", USUAL_P, partial(_read_corners, how=how), say_always(CORNERS[how].message),
             say_always(CORNERS[how].fix), shows=True,
         )  # fmt: skip
-    for convention in filter(None, [find_convention(recording, mistakes.USUAL)]):
+    for convention in filter(None, [find_convention(recording, USUAL)]):
         yield Suspect(
             "detection-poses", "detections", USUAL_P, partial(_read_detections, convention=convention),
             say_always(SIGHTED[convention]), say_always("detections.csv: x_m, y_m, z_m, qx, qy, qz, qw"), shows=True,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from evermap.slam import mistakes
+from evermap.slam.pairs import USUAL
 from evermap.types import UNKNOWN, AnyRecording, FloatArray, Landmarks
 
 USUAL_P, RARE_P, UNIT_P = 1e-3, 1e-4, 1e-3
@@ -120,7 +121,7 @@ def list_often_seen(recording: AnyRecording) -> list[int]:
     """Return identities that were seen often enough to ask of each."""
     ids = recording.detections.landmark_id
     name, count = np.unique(ids[ids != UNKNOWN], return_counts=True)
-    return [int(one) for one in name[count >= mistakes.USUAL.fewest // 4]]
+    return [int(one) for one in name[count >= USUAL.fewest // 4]]
 
 
 def say_always(text: str) -> Callable[[float], str]:

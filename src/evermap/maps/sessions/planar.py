@@ -27,7 +27,7 @@ from evermap.slam.batch import Outcome, silent_links
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.intake import find_bodies
-from evermap.slam.mistakes import unusable
+from evermap.slam.mistake_search import unusable
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, Sensor, SlamResult
 
 

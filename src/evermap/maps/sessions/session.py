@@ -41,7 +41,7 @@ from evermap.slam import plane
 from evermap.slam.association.features import medians
 from evermap.slam.cleaning import clean
 from evermap.slam.estimate import Solved, solve
-from evermap.slam.mistakes import unusable
+from evermap.slam.mistake_search import unusable
 from evermap.slam.space.up import with_known_up
 from evermap.types import (
     UNKNOWN,
