@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from evermap import Config, run_slam
 from evermap.explain.carried import APART_M, AT_TWO, CARRIED, ELSEWHERE, _fill_places, find_carried
-from evermap.explain.symptoms import find_instants, find_poses_at, locate_detections
+from evermap.explain.expectations import find_instants, find_poses_at, locate_detections
 from evermap.geometry import se2
 from evermap.slam.plane import in_its_space
 from evermap.types import UNKNOWN, AnyRecording, SlamResult, VerdictKind

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.explain.symptoms import compare_detections, find_instants, find_poses_at, locate_detections
+from evermap.explain.expectations import compare_detections, find_instants, find_poses_at, locate_detections
 from evermap.geometry import se2, se3
 from evermap.types import UNKNOWN, AnyRecording, BoolArray, Cause, FloatArray, IntArray, SlamResult
 

@@ -15,15 +15,9 @@ from math import degrees, isnan, nan
 
 import numpy as np
 
+from evermap.explain.expectations import PER_LANDMARK, USED, compare_detections, find_poses_at
 from evermap.explain.jitter import find_jitter
-from evermap.explain.symptoms import (
-    PER_LANDMARK,
-    USED,
-    compare_detections,
-    find_motions,
-    find_poses_at,
-    find_turns_between,
-)
+from evermap.explain.motions import find_motions, find_turns_between
 from evermap.geometry import se2, se3
 from evermap.slam.check import CLOCKWISE, CORNERS, RIDER, SILENCE, is_clockwise
 from evermap.slam.gaps import find_gaps, is_outside

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.explain.symptoms import compare_detections
+from evermap.explain.expectations import compare_detections
 from evermap.geometry import se2, se3
 from evermap.types import AnyRecording, Cause, FloatArray, IntArray, SlamResult, Trajectory, is_in_space
 

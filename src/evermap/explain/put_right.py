@@ -11,8 +11,8 @@ from evermap.errors import EvermapError
 from evermap.explain.answer import CLOCK, OWN_STATES, find_ratio
 from evermap.explain.causes import list_suspects
 from evermap.explain.causes.suspect import Inputs
+from evermap.explain.motions import SURELY, find_odometry_delay
 from evermap.explain.scores import is_unusual, score_odometry
-from evermap.explain.symptoms import SURELY, find_odometry_delay
 from evermap.explain.trial import Explained, SessionSolution, Solve, Taken, VisitT
 from evermap.explain.triggers import LENGTH_OFF
 from evermap.slam.estimate import Solved

@@ -10,8 +10,8 @@ from evermap.config import SlamConfig
 from evermap.explain.causes.mounts import MOUNT_M
 from evermap.explain.causes.sizes import has_scale
 from evermap.explain.causes.suspect import Inputs
+from evermap.explain.motions import compare_odometry
 from evermap.explain.seeds import find_mount, find_sensor_scales, find_single_scales
-from evermap.explain.symptoms import compare_odometry
 from evermap.explain.trial import INLIER, OF_NOISE, share_rejected
 from evermap.slam.check import find_misreadings
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, SlamResult, is_in_space

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap.config import Config
-from evermap.explain.symptoms import compare_detections
+from evermap.explain.expectations import compare_detections
 from evermap.geometry import se3
 from evermap.io.spatial import spatial_detections
 from evermap.pipeline import run_slam
