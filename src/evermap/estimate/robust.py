@@ -1,4 +1,4 @@
-"""The robust rule: how much a factor counts, by the square of its normalised residual."""
+"""The robust rule: how much a factor counts, by the square of its normalised residual; and a robust scale of errors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 from evermap.compiled import kept
 
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of normal errors over the median of their sizes: the scale of a median absolute deviation."""
 HEAVY_TAIL = 9.0
 """Square of a residual at which the Cauchy begins, while the estimate may be far off."""
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evermap.estimate.robust import MEDIAN_TO_SIGMA
 from evermap.explain.expectations import compare_detections
 from evermap.geometry import se2, se3
 from evermap.types import AnyRecording, Cause, FloatArray, IntArray, SlamResult, Trajectory, is_in_space
@@ -67,7 +68,7 @@ def measure_jitter(result: SlamResult, recording: AnyRecording) -> Jitter | None
     ends = [(view[end], name[end]) for end in (after, before)]
 
     def multiply_opposite(values: list[FloatArray], factor: list[FloatArray]) -> FloatArray:
-        most = CLIPPED * 1.4826 * float(np.median(np.abs(values[0])))
+        most = CLIPPED * MEDIAN_TO_SIGMA * float(np.median(np.abs(values[0])))
         one, two = (by * np.clip(each, -most, most) for each, by in zip(values, factor, strict=True))
         return -_multiply((one, *ends[0]), (two, *ends[1]))
 

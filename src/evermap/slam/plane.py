@@ -20,6 +20,7 @@ import numpy as np
 from evermap.config import CheckConfig, SlamConfig
 from evermap.errors import ConfigError
 from evermap.estimate.measurements import find_kinds
+from evermap.estimate.robust import MEDIAN_TO_SIGMA
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import are_of_several_clocks
 from evermap.slam.mistake_search import unusable
@@ -177,7 +178,7 @@ def is_tilted(apart: FloatArray) -> bool:
         information = along.T @ (weight[:, None] * along)
         tilt = np.linalg.solve(information, along.T @ (weight * apart[:, 2]))
         left = apart[:, 2] - along @ tilt
-        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        scale = max(MEDIAN_TO_SIGMA * float(np.median(np.abs(left))), 1e-9)
         weight = 1.0 / (1.0 + (left / (CAUCHY * scale)) ** 2)
     sigma = scale * np.sqrt(np.diag(np.linalg.inv(information)))
     return bool((np.abs(tilt) > np.maximum(TILT_RAD, TILT_SIGMAS * sigma)).any())

@@ -36,8 +36,9 @@ from evermap.types import (
 RANGE_ONLY = "a range without a bearing is located by what is seen later, which is not causal"
 """Why a robot cannot use it while it drives."""
 OF_MEDIAN, CHANGED, SWAY = 0.6745, 3.0, 0.02
-"""Median of the sizes of normal numbers over their standard deviation; standard deviations of a difference from which
-the robot moved; and share of a range by which it may change as a robot stands."""
+"""Median of the sizes of normal numbers over their standard deviation, rounded (1 / `estimate.robust.MEDIAN_TO_SIGMA`
+differs from it in the fifth figure); standard deviations of a difference from which the robot moved; and share of a
+range by which it may change as a robot stands."""
 
 
 class Ranged(NamedTuple):

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from evermap.config import ReadingsConfig, SlamConfig
+from evermap.estimate.robust import MEDIAN_TO_SIGMA
 from evermap.slam.batch import USUAL
 from evermap.slam.kernels import kernel
 from evermap.types import FloatArray, IntArray
@@ -303,7 +304,7 @@ def _within(
     of = visit[seen]
     left = 1.0 - 1.0 / np.maximum(read[of], 1.5)
     off = np.where(read[of] > 1, value[seen] - middle[of], np.nan)
-    reading = (1.4826 * column_medians(np.abs(off) / np.sqrt(left))) ** 2
+    reading = (MEDIAN_TO_SIGMA * column_medians(np.abs(off) / np.sqrt(left))) ** 2
     reading = np.where(reading > 0.0, reading, _clipped(off, left, settings))  # the median is 0 if values are rounded
     order = np.lexsort((seen, of))  # detections are in the order of time
     size = np.bincount(of, minlength=len(middle))
