@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,14 +11,24 @@ import numpy as np
 from evermap.compiled import single_threaded
 from evermap.config import Config
 from evermap.errors import ConfigError, DataError, InputError
-from evermap.types import AnyRecording, IntArray, Landmarks, Progress, Recording, SlamResult, is_in_space
+from evermap.types import (
+    AnyRecording,
+    AssociationEvidence,
+    Cause,
+    IntArray,
+    Landmarks,
+    Progress,
+    Recording,
+    SlamResult,
+    is_in_space,
+)
 
 if TYPE_CHECKING:
-    from evermap.explain.causes.suspect import Inputs
+    from evermap.explain.trial import SessionSolution
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.placing import Localised
     from evermap.maps.sessions.planar import PlanarVisit
-    from evermap.maps.sessions.session import Session
+    from evermap.maps.sessions.session import Session, Visit
     from evermap.maps.sessions.spatial import SpatialVisit
     from evermap.slam.estimate import Solved
     from evermap.slam.mistakes import Finding
@@ -48,73 +58,139 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
-    from evermap.explain.carried import Carried, find_carried, name_carried
-    from evermap.explain.causes.suspect import Inputs
     from evermap.explain.faults import with_mended
-    from evermap.explain.trial import SessionSolution
     from evermap.explain.verdict import with_verdict
-    from evermap.maps.sessions import nameless, session
-    from evermap.slam import association, check, plane
-    from evermap.slam.mistakes import NO_ODOMETRY
-    from evermap.slam.moving_bodies import without_motion
     from evermap.slam.space.moving import has_traffic, run_in_traffic
-    from evermap.slam.space.up import with_known_up
-    from evermap.slam.votes import list_doubled_ids, without_identities
 
-    config = config or Config()
+    case = _name_landmarks(_screen(recording, prior_map, config or Config()))
+    if has_traffic(case.recording):
+        settings, track = case.config.slam, case.config.track
+        result = run_in_traffic(case.recording, settings.space, track, case.prior_map, progress)
+        return with_verdict(result, case.recording, settings, findings=case.found)
+    case = _leave_out_motion(case)
+    result, solution = _conclude(case, realtime=realtime, progress=progress)
+    if realtime or not case.config.slam.explain.on:
+        return result
+    case, result, solution, carried = _leave_out_carried(case, result, solution)
+    if not result.causes and _is_held(result):  # its scores cost too much to be asked before all else is sound
+        result, _ = _conclude(case, is_suspected=True, solution=solution)
+    return with_mended(result, carried)
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """What `run_slam` estimates.
+
+    Attributes:
+        config: settings.
+        read: the recording with the identities that it was read with.
+        recording: as it is estimated.
+        prior_map: that was given; None without.
+        remarks: on the recording, the first warnings.
+        found: what was read wrongly.
+        doubled: identities that two landmarks have at once.
+        evidence: for identities that were found, not read.
+        is_read_well: whether pairs of sightings are known to show no mistake.
+        left_out: identities of landmarks that are carried about.
+    """
+
+    config: Config
+    read: AnyRecording
+    recording: AnyRecording
+    prior_map: Landmarks | None
+    remarks: tuple[str, ...]
+    found: tuple[Finding, ...]
+    doubled: IntArray
+    evidence: AssociationEvidence | None = None
+    is_read_well: bool = False
+    left_out: tuple[int, ...] = ()
+
+
+def _screen(recording: AnyRecording, prior_map: Landmarks | None, config: Config) -> _Case:
+    """Return a recording in its space, without what is certainly wrong with it."""
+    from evermap.slam import check, plane
+    from evermap.slam.votes import list_doubled_ids
+
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     read, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
     recording, remarks, found = check.screened(read, config, prior_map)
     remarks, found = (*(one.message for one in riders), *told, *remarks), (*riders, *found)
-    doubled = list_doubled_ids(read, recording)
-    if config.slam.unknown_ids and prior_map is not None:
-        recording, evidence = nameless.identify_in(recording, prior_map, config)
+    return _Case(config, read, recording, prior_map, remarks, found, list_doubled_ids(read, recording))
+
+
+def _name_landmarks(case: _Case) -> _Case:
+    """Return the same with identities of landmarks that were read without, where these are asked for."""
+    from evermap.maps.sessions import nameless
+    from evermap.slam import association
+
+    config, remarks = case.config, case.remarks
+    if config.slam.unknown_ids and case.prior_map is not None:
+        recording, evidence = nameless.identify_in(case.recording, case.prior_map, config)
     else:
-        recording, evidence = association.identify_landmarks(recording, config.slam)
+        recording, evidence = association.identify_landmarks(case.recording, config.slam)
     if evidence is not None:
         remarks = (*remarks, *association.describe_doubts(evidence, config.slam.association))
-    if has_traffic(recording):
-        result = run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
-        return with_verdict(result, recording, config.slam, findings=found)
-    is_read_well = recording.detections is read.detections and all(finding.usable for finding in found)
+    is_read_well = recording.detections is case.read.detections and all(finding.usable for finding in case.found)
+    return replace(case, recording=recording, evidence=evidence, remarks=remarks, is_read_well=is_read_well)
+
+
+def _leave_out_motion(case: _Case) -> _Case:
+    """Return the same, in the plane, without what moves while the robot drives, and without what rides along."""
+    from evermap.slam.mistakes import NO_ODOMETRY
+    from evermap.slam.moving_bodies import without_motion
+
+    config, recording, remarks = case.config, case.recording, case.remarks
     if not is_in_space(recording):
         recording, moved = without_motion(recording, config)
         remarks = (*remarks, *moved)
-        if any(finding.code == NO_ODOMETRY for finding in found):  # all landmarks move: to ask which says nothing
+        if any(finding.code == NO_ODOMETRY for finding in case.found):  # all landmarks move: to ask which says nothing
             config = _without_changes(config)
-    if len(read.detections) != len(recording.detections):  # what rides along in the plane was left out
-        read = recording
+    is_shorter = len(case.read.detections) != len(recording.detections)  # what rides along in the plane was left out
+    read = recording if is_shorter else case.read
+    return replace(case, config=config, read=read, recording=recording, remarks=remarks)
 
-    def conclude(
-        given: Inputs, read: AnyRecording, not_missed: list[int], **more: Any
-    ) -> tuple[SlamResult, SessionSolution[session.Visit]]:
-        visit, result, asked = session.explained(given, config, remarks, is_read_well=is_read_well, **more)
-        solution = SessionSolution(visit, asked, result)
-        result = replace(session.existing(visit, result, config.living), association=evidence)
-        if prior_map is not None:
-            expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
-            result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
-        result = _judge(
-            result, asked.inputs.recording, config, asked.inputs.prior_map, found, doubled,
-            as_read=read, asked=asked,
-        )  # fmt: skip
-        return result, solution
 
-    of_all = Inputs.of(recording, prior_map), read, doubled.tolist()  # what was read was not missed
-    (result, solution), carried = conclude(*of_all, realtime=realtime, progress=progress), tuple[Carried, ...]()
-    if realtime or not config.slam.explain.on:
-        return result
-    if config.slam.unknown_ids is not True and (suspects := find_carried(result, read)):
-        names = [one.landmark_id for one in suspects]
-        rest, read_rest = without_identities(recording, names), without_identities(read, names)
-        of_rest = Inputs.of(rest, prior_map), read_rest, [*of_all[2], *names]
-        other = conclude(*of_rest)
-        confirmed = find_carried(other[0], read)  # along poses that they do not bend
-        if [one.landmark_id for one in confirmed] == names:
-            of_all, (result, solution), carried = of_rest, other, confirmed
-    if not result.causes and _is_held(result):  # its scores cost too much to be asked before all else is sound
-        result, _ = conclude(*of_all, is_suspected=True, solution=solution)
-    return with_mended(result, tuple(name_carried(one, read) for one in carried))
+def _conclude(case: _Case, **more: Any) -> tuple[SlamResult, SessionSolution[Visit]]:
+    """Return a case solved, with what exists, faults and verdict; and its solution; `more` is as of `explained`."""
+    from evermap.explain.causes.suspect import Inputs
+    from evermap.explain.trial import SessionSolution
+    from evermap.maps.sessions import session
+    from evermap.slam.space.up import with_known_up
+
+    config, prior_map = case.config, case.prior_map
+    given = Inputs.of(case.recording, prior_map)
+    visit, result, asked = session.explained(given, config, case.remarks, is_read_well=case.is_read_well, **more)
+    solution = SessionSolution(visit, asked, result)
+    result = replace(session.existing(visit, result, config.living), association=case.evidence)
+    if prior_map is not None:
+        not_missed = [*case.doubled.tolist(), *case.left_out]  # what was read was not missed
+        expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
+        result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
+    result = _judge(
+        result, asked.inputs.recording, config, asked.inputs.prior_map, case.found, case.doubled,
+        as_read=case.read, asked=asked,
+    )  # fmt: skip
+    return result, solution
+
+
+def _leave_out_carried(
+    case: _Case, result: SlamResult, solution: SessionSolution[Visit]
+) -> tuple[_Case, SlamResult, SessionSolution[Visit], tuple[Cause, ...]]:
+    """Return case, result and solution without landmarks that are carried about, where there are any, and which."""
+    from evermap.explain.carried import find_carried, name_carried
+    from evermap.slam.votes import without_identities
+
+    as_given = case, result, solution, ()
+    if case.config.slam.unknown_ids is True or not (suspects := find_carried(result, case.read)):
+        return as_given
+    names = tuple(one.landmark_id for one in suspects)
+    rest, read = without_identities(case.recording, names), without_identities(case.read, names)
+    without = replace(case, recording=rest, read=read, left_out=names)
+    result, solution = _conclude(without)
+    confirmed = find_carried(result, case.read)  # along poses that they do not bend
+    if tuple(one.landmark_id for one in confirmed) != names:
+        return as_given
+    return without, result, solution, tuple(name_carried(one, case.read) for one in confirmed)
 
 
 def _without_changes(config: Config) -> Config:
