@@ -171,6 +171,23 @@ def test_no_rhythm_is_found_where_there_is_none(looks: str) -> None:
         assert fit.count_s(stays.group, stays.first_s) is stays.first_s
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("kind", "is_searched"), [("none", False), ("mild", True), ("night", True)])
+def test_a_rhythm_is_searched_for_where_it_may_have_evidence(
+    kind: str, seed: int, is_searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The evidence of a likelihood that is a quadratic, without a search, and that which the search finds."""
+    stays = make_stays(kind, seed)
+    likelihood = HourLikelihood.of(stays, [Exponential(MEAN_S)], None)
+    nearly = likelihood.fit()[1]
+    monkeypatch.setattr(HourLikelihood, "_weigh_nearly", lambda *_: np.inf)
+    found = likelihood.fit()[1]
+    assert (nearly == found) == is_searched
+    if not is_searched:
+        assert nearly == pytest.approx(found, abs=2.0)
+        assert found < 0.5
+
+
 def test_looks_at_one_hour_show_none() -> None:
     """What leaves at night, looked at at noon: the day of an end is known, its hour is not."""
     for seed in range(3):

@@ -50,6 +50,8 @@ LEAST_NATS = 3.0
 """Log evidence for a rhythm against none from which there is one."""
 MOST_AGAINST = 2.0
 """Nats against the common rhythm from which a class does not follow it; of a class with a stated lifetime, for it."""
+ROUGH = tuple(10.0**power for power in range(-2, 7, 2))
+"""Weights of penalties of which one shows whether a rhythm is worth a search."""
 LEAST = -700.0
 """Log likelihood of an end that a lifetime does not know."""
 _NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-6
@@ -203,6 +205,8 @@ def _find_followers(
     n = len(follows)
     for _ in range(n + 1):
         log_factor, log_evidence = likelihood.of_groups(follows).fit()
+        if log_evidence < LEAST_NATS:  # which classes it suits says nothing
+            break
         gains = likelihood.gains(log_factor, n)
         after = np.asarray(np.where(stated, gains > MOST_AGAINST, gains > -MOST_AGAINST))
         if (after == follows).all() or not after.any():
@@ -310,6 +314,9 @@ class HourLikelihood:
 
         level, level_covariance, flat = self._maximise(columns[:, :1], np.zeros(1), fixed[:1, :1])
         start = np.append(level, np.zeros(p - 1))
+        nearly = self._weigh_nearly(columns, start, penalties, fixed)
+        if nearly < 0.0:  # far from what a rhythm needs
+            return np.zeros(HOURS), nearly
         beta, weights, _ = find_smoothness(maximise, start, np.ones(len(penalties)), penalties, fixed)
         penalty = weigh_penalties(weights, penalties, fixed)
         beta, covariance, best = self._maximise(columns, beta, penalty)
@@ -317,6 +324,26 @@ class HourLikelihood:
         log_evidence += 0.5 * (_logdet(covariance) - _logdet(level_covariance))
         log_factor = columns[:, 1:] @ beta[1:]
         return log_factor - np.log(np.mean(np.exp(log_factor))), log_evidence
+
+    def _weigh_nearly(
+        self, columns: FloatArray, start: FloatArray, penalties: Sequence[FloatArray], fixed: FloatArray
+    ) -> float:
+        """Return about the largest log evidence that a factor may have against the constant `start`.
+
+        The likelihood is a quadratic there (a score test), one part at a time has several smoothnesses, and the others
+        the largest.
+        """
+        slope, information = self.curvature(columns @ start)
+        slope, information, found = columns.T @ slope, columns.T @ information @ columns, -np.inf
+        slope[0] = 0.0  # the level is where it is best
+        for part in range(len(penalties)):
+            for weight in ROUGH:
+                weights = np.where(np.arange(len(penalties)) == part, weight, ROUGH[-1])
+                penalty = weigh_penalties(weights, penalties, fixed)[1:, 1:]
+                bent = information[1:, 1:] + penalty
+                gain = slope[1:] @ np.linalg.solve(bent, slope[1:])
+                found = max(found, 0.5 * (float(gain) + _logdet(penalty) - _logdet(bent)))
+        return found
 
     def _maximise(
         self, columns: FloatArray, beta: FloatArray, penalty: FloatArray
