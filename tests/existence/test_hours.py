@@ -239,7 +239,7 @@ def test_likelihood_is_that_of_stays_on_the_clock() -> None:
     likelihood = HourLikelihood.of(stays, [Exponential(1.0 / MEAN_S)], None)
     log_factor = np.random.default_rng(0).normal(0.0, 0.7, HOURS)
     rhythm = Rhythm(np.repeat(log_factor, round(HOUR_S / BIN_S)))
-    first, last, gone = (rhythm.elapsed_s(at) for at in (stays.first_s, stays.last_s, stays.gone_s))
+    first, last, gone = (rhythm.count_s(at) for at in (stays.first_s, stays.last_s, stays.gone_s))
     left, right = np.exp(-(last - first) / MEAN_S), np.exp(-(gone - first) / MEAN_S)
     np.testing.assert_allclose(likelihood.values(log_factor), np.log(left - right), rtol=1e-9)
 
@@ -345,10 +345,10 @@ def test_clock_of_a_rhythm_is_the_integral_of_its_factor() -> None:
     bins = ((fine - MONDAY_S) % WEEK_S // BIN_S).astype(int)
     summed = np.append(0.0, np.cumsum(rhythm.factor[bins]))
     at = np.array([0, 12345, 86400, 700000])
-    np.testing.assert_allclose(rhythm.elapsed_s(fine[at]) - rhythm.elapsed_s(START_S), summed[at], rtol=1e-9)
-    assert rhythm.elapsed_s(np.array([np.inf, -np.inf])).tolist() == [np.inf, -np.inf]
+    np.testing.assert_allclose(rhythm.count_s(fine[at]) - rhythm.count_s(START_S), summed[at], rtol=1e-9)
+    assert rhythm.count_s(np.array([np.inf, -np.inf])).tolist() == [np.inf, -np.inf]
     flat = Rhythm(np.zeros(BINS))
-    assert flat.elapsed_s(START_S + 1e6) - flat.elapsed_s(START_S) == pytest.approx(1e6)
+    assert flat.count_s(START_S + 1e6) - flat.count_s(START_S) == pytest.approx(1e6)
 
 
 def follow(

@@ -4,7 +4,7 @@
 
 Ages are measured on a clock that runs as fast as things happen, the *operational time* of renewal processes (Lewis and
 Shedler 1979; Lawless 2003, 2.3). So every stay is still one with a hazard by age, its likelihood is exact, and a look
-costs as much as before: stamps go through `Rhythm.elapsed_s`, once. MATH.md section 9 has the age on the wall there;
+costs as much as before: stamps go through `Rhythm.count_s`, once. MATH.md section 9 has the age on the wall there;
 both are the same where the hazard depends on one of the two alone, and over whole weeks, in which tau passes as much.
 
 `exp(g)` has the mean 1 over the week. Given the hazards by age, a stay that was seen over hours of integrated hazards
@@ -37,6 +37,7 @@ from evermap.existence.rhythm import (
 from evermap.survival.base import LifetimePrior
 from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.survival.logmath import log_sum_exp
+from evermap.survival.newton import climb, drop_negative, log_determinant
 from evermap.types import BoolArray, FloatArray, IntArray
 
 HOUR_S = 3600.0
@@ -54,7 +55,7 @@ ROUGH = tuple(10.0**power for power in range(-2, 7, 2))
 """Weights of penalties of which one shows whether a rhythm is worth a search."""
 LEAST = -700.0
 """Log likelihood of an end that a lifetime does not know."""
-_NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-6
+_SETTLED = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +114,7 @@ class HourFit:
         if self.rhythm is None:
             return stamp_s
         follows = self.follows[group].reshape(-1, *(1,) * (np.ndim(stamp_s) - 1))
-        return np.where(follows, self.rhythm.elapsed_s(stamp_s), stamp_s)
+        return np.where(follows, self.rhythm.count_s(stamp_s), stamp_s)
 
 
 Posteriors = Sequence[HazardPosterior]
@@ -234,7 +235,7 @@ class HourLikelihood:
     @classmethod
     def of(cls, stays: DatedStays, lifetimes: Sequence[LifetimePrior], before: HourFit | None) -> HourLikelihood:
         """Integrate the hazards of stays by the hour."""
-        tau = before.rhythm.elapsed_s if before is not None and before.rhythm is not None else np.asarray
+        tau = before.rhythm.count_s if before is not None and before.rhythm is not None else np.asarray
         n = len(stays.first_s)
         seen, ending = np.zeros((2, n, HOURS))
         gone_s = np.where(np.isfinite(stays.gone_s), stays.gone_s, stays.last_s)
@@ -320,8 +321,8 @@ class HourLikelihood:
         beta, weights, _ = find_smoothness(maximise, start, np.ones(len(penalties)), penalties, fixed)
         penalty = weigh_penalties(weights, penalties, fixed)
         beta, covariance, best = self._maximise(columns, beta, penalty)
-        log_evidence = best - flat + 0.5 * (_logdet(penalty) - _logdet(fixed[:1, :1]))
-        log_evidence += 0.5 * (_logdet(covariance) - _logdet(level_covariance))
+        log_evidence = best - flat + 0.5 * (log_determinant(penalty) - log_determinant(fixed[:1, :1]))
+        log_evidence += 0.5 * (log_determinant(covariance) - log_determinant(level_covariance))
         log_factor = columns[:, 1:] @ beta[1:]
         return log_factor - np.log(np.mean(np.exp(log_factor))), log_evidence
 
@@ -342,7 +343,7 @@ class HourLikelihood:
                 penalty = weigh_penalties(weights, penalties, fixed)[1:, 1:]
                 bent = information[1:, 1:] + penalty
                 gain = slope[1:] @ np.linalg.solve(bent, slope[1:])
-                found = max(found, 0.5 * (float(gain) + _logdet(penalty) - _logdet(bent)))
+                found = max(found, 0.5 * (float(gain) + log_determinant(penalty) - log_determinant(bent)))
         return found
 
     def _maximise(
@@ -365,40 +366,14 @@ class HourLikelihood:
         def bend(beta: FloatArray) -> tuple[FloatArray, FloatArray]:
             slope, information = self.curvature(columns @ beta)
             pull = columns.T @ (slope + half) - penalty @ beta
-            return pull, _usable(columns.T @ information @ columns, penalty) + penalty
+            return pull, drop_negative(columns.T @ information @ columns, penalty) + penalty
 
-        best = goodness(beta)
-        slope, hessian = bend(beta)
-        for _ in range(_NEWTON):
-            step = np.linalg.solve(hessian, slope)
-            share = min(1.0, _STEP / max(float(np.abs(columns @ step).max()), 1e-300))
-            while (after := goodness(beta + share * step)) < best and share > 1e-6:
-                share *= 0.5
-            gain = after - best
-            if gain > 0.0:
-                beta, best = beta + share * step, after
-                slope, hessian = bend(beta)
-            if gain < _SETTLED:
-                break
+        beta, hessian, best = climb(goodness, bend, beta, columns, _SETTLED)
         return beta, np.asarray(np.linalg.inv(hessian), dtype=np.float64), best
-
-
-def _usable(information: FloatArray, penalty: FloatArray) -> FloatArray:
-    """Return the information without negative directions, where with half of the penalty it has any."""
-    try:
-        np.linalg.cholesky(information + 0.5 * penalty)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-    return information
 
 
 def _beside_level(matrix: FloatArray) -> FloatArray:
     return np.pad(matrix, ((1, 0), (1, 0)))
-
-
-def _logdet(matrix: FloatArray) -> float:
-    return float(np.linalg.slogdet(matrix)[1])
 
 
 def _cells(start_s: FloatArray, stop_s: FloatArray) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:

@@ -54,7 +54,7 @@ class Rhythm(Shown):
         """(1008,) by what the hazard is multiplied."""
         return np.asarray(np.exp(self.log_factor), dtype=np.float64)
 
-    def elapsed_s(self, stamp_s: ArrayLike) -> FloatArray:
+    def count_s(self, stamp_s: ArrayLike) -> FloatArray:
         """Return the integral (...) of the factor from a Monday 00:00 until stamps (...): a clock that runs as fast as
         things happen. What is not finite stays as it is.
         """

@@ -526,15 +526,15 @@ class _SeatClock:
         age = until_s - since_s
         if self.rhythm is not None:
             hourly = self.hourly if row is None else self.hourly[row]
-            age = np.where(hourly, self.rhythm.elapsed_s(until_s) - self.rhythm.elapsed_s(since_s), age)
+            age = np.where(hourly, self.rhythm.count_s(until_s) - self.rhythm.count_s(since_s), age)
         return np.asarray(np.maximum(age, 0.0))
 
     def steps_s(self, start_s: FloatArray, step_s: FloatArray, begin: FloatArray, steps: FloatArray) -> FloatArray:
         """Return what passes (H, B, M) on the clock of its seats in steps (M,) after the first `begin` (B,) ones."""
         assert self.rhythm is not None
         start, step = start_s[self.rows, None, None], step_s[self.rows, None, None]
-        until = self.rhythm.elapsed_s(start + step * (begin[:, None] + steps))
-        return np.asarray(until - self.rhythm.elapsed_s(start + step * begin[:, None]))
+        until = self.rhythm.count_s(start + step * (begin[:, None] + steps))
+        return np.asarray(until - self.rhythm.count_s(start + step * begin[:, None]))
 
 
 def _between_frames(

@@ -42,7 +42,7 @@ APART_M, FEWEST_APART = 1.0, 8
 FEWEST_OF_PAIR, STEADY = 3, 0.03
 """Times that a sensor must see two landmarks at once, and median deviation of the logarithm of their distance, up to
 which it is one that sensors can be compared by."""
-OF_MEDIAN, TIMES_SIGMA = 1.86, 5.0
+ERROR_OF_MEDIAN, TIMES_SIGMA = 1.86, 5.0
 """Standard deviation of a median of normal numbers, over their median deviation, and by their root; and times that from
 which it is not 0."""
 FEWEST_VIEWS, PARALLAX = 6, 0.02
@@ -168,7 +168,7 @@ def _find_level(off: FloatArray) -> float:
     if len(off) < FEWEST_APART:
         return math.nan
     level = float(np.median(off))
-    sigma = OF_MEDIAN * float(np.median(np.abs(off - level))) / math.sqrt(len(off))
+    sigma = ERROR_OF_MEDIAN * float(np.median(np.abs(off - level))) / math.sqrt(len(off))
     return level if abs(level) > TIMES_SIGMA * sigma else 0.0
 
 

@@ -97,7 +97,7 @@ class Lives:
         age, rhythm = until_s - since_s, self.rhythm
         if rhythm is None:
             return age
-        return np.where(self.follows(class_id), rhythm.elapsed_s(until_s) - rhythm.elapsed_s(since_s), age)
+        return np.where(self.follows(class_id), rhythm.count_s(until_s) - rhythm.count_s(since_s), age)
 
     def of(self, class_id: int, position_m: FloatArray | None = None) -> Life:
         """Return the life of a class (or `UNKNOWN`), at a position (2,), in space (3,), or on the whole floor: learned,

@@ -37,6 +37,7 @@ from evermap.survival.hazard_grid import (
 )
 from evermap.survival.hazard_posterior import HazardPosterior, integrate_expected
 from evermap.survival.logmath import TINY, log_sum_exp
+from evermap.survival.newton import LONGEST, MOST_STEPS, climb, drop_negative, log_determinant
 from evermap.survival.stay_likelihood import StayAges, StayLikelihood
 from evermap.types import FloatArray, IntArray
 
@@ -52,7 +53,7 @@ FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
 """Standard deviations at which exact densities are computed, and those between; the two which tell whether to."""
 STRAIGHT, HEAVIEST = 0.1, 16.0
 """Difference of log densities there up to which the normal one is kept; and the largest weight, in mean ones."""
-_NEWTON, _STEP, _SETTLED = 40, 2.0, 1e-4
+_SETTLED = 1e-4
 _EXACT = 1e-12
 """Relative error of a stated hazard."""
 
@@ -241,7 +242,9 @@ class _Together:
             with np.errstate(over="ignore", invalid="ignore"):
                 value, gradients, curvatures = self.every.by_class(base * np.exp(v @ columns.T), self.row)
             value -= 0.5 * of_shared * float(s @ s) + 0.5 * of_own * float(np.square(v - s).sum())
-            informations = np.array([_usable(one, of_own) for one in -columns.T @ curvatures @ columns])
+            informations = np.array(
+                [drop_negative(one, of_own * np.eye(r)) for one in -columns.T @ curvatures @ columns]
+            )
             informations = informations.reshape(n, r, r)
             return value if np.isfinite(value) else -np.inf, gradients @ columns, informations
 
@@ -251,7 +254,7 @@ class _Together:
             start = near.shared @ onto, near.own @ onto
             if (there := bent(*start))[0] > best:
                 (shared, own), (best, slopes, informations) = start, there
-        for _ in range(_NEWTON):
+        for _ in range(MOST_STEPS):
             pull = slopes - of_own * (own - shared)
             inverse = np.linalg.inv(informations + of_own * np.eye(r))
             matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
@@ -259,7 +262,7 @@ class _Together:
             slope = -of_shared * shared + of_own * ((own - shared) + solved).sum(axis=0)
             step = np.linalg.solve(matrix, slope)
             steps = solved + of_own * inverse @ step
-            factor = min(1.0, _STEP / max(float(np.abs(steps @ columns.T).max(initial=0.0)), 1e-300))
+            factor = min(1.0, LONGEST / max(float(np.abs(steps @ columns.T).max(initial=0.0)), 1e-300))
             while (after := bent(shared + factor * step, own + factor * steps))[0] < best and factor > 1e-4:
                 factor *= 0.5
             gain = after[0] - best
@@ -271,8 +274,8 @@ class _Together:
         hessian = informations + of_own * np.eye(r)
         inverse = np.linalg.inv(hessian)
         matrix = (of_shared + n * of_own) * np.eye(r) - of_own**2 * inverse.sum(axis=0)
-        evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * _logdet(matrix)
-        evidence -= 0.5 * sum(_logdet(one) for one in hessian)
+        evidence = best + 0.5 * r * (np.log(of_shared) + n * np.log(of_own)) - 0.5 * log_determinant(matrix)
+        evidence -= 0.5 * sum(log_determinant(one) for one in hessian)
         of_each, of_both = (np.asarray(np.linalg.inv(one), dtype=np.float64) for one in (hessian, matrix))
         return _Mode(scale, shared, own, slopes, hessian, of_each, of_both, float(evidence))
 
@@ -361,20 +364,6 @@ class _Line:
         return found, weight / weight.sum(), float(gain)
 
 
-def _usable(information: FloatArray, least: float) -> FloatArray:
-    """Return the information without its negative directions, if with `least` in all it has any."""
-    try:
-        np.linalg.cholesky(information + 0.5 * least * np.eye(len(information)))
-    except np.linalg.LinAlgError:  # within a wide interval the likelihood may be convex
-        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-    return information
-
-
-def _logdet(matrix: FloatArray) -> float:
-    return float(np.linalg.slogdet(matrix)[1])
-
-
 def _root(covariance: Any) -> FloatArray:
     """Return the symmetric R with `R R = covariance`."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
@@ -435,24 +424,11 @@ def _fit_alone(
     def bent(z: FloatArray) -> tuple[FloatArray, FloatArray]:
         v = columns @ z
         _, slope, curvature = likelihood(base * np.exp(v))
-        hessian = _usable(-columns.T @ curvature @ columns, 1.0) + _precision(scale, ends * np.exp(v))
+        hessian = drop_negative(-columns.T @ curvature @ columns, np.eye(len(z))) + _precision(scale, ends * np.exp(v))
         return columns.T @ (slope - ends * np.expm1(v)) - z, hessian
 
-    z: FloatArray = np.zeros(columns.shape[1])
-    best = goodness(z)
-    for _ in range(_NEWTON):
-        slope, hessian = bent(z)
-        step = np.linalg.solve(hessian, slope)
-        factor = min(1.0, _STEP / max(float(np.abs(columns @ step).max()), 1e-300))
-        while (after := goodness(z + factor * step)) < best and factor > 1e-6:
-            factor *= 0.5
-        gain = after - best
-        if gain > 0.0:
-            z, best = z + factor * step, after
-        if gain < _SETTLED:
-            break
-    hessian = bent(z)[1]
-    evidence = best + 0.5 * _logdet(_precision(scale, ends)) - 0.5 * _logdet(hessian)
+    z, hessian, best = climb(goodness, bent, np.zeros(columns.shape[1]), columns, _SETTLED)
+    evidence = best + 0.5 * log_determinant(_precision(scale, ends)) - 0.5 * log_determinant(hessian)
     return evidence, z, np.asarray(np.linalg.inv(hessian), dtype=np.float64)
 
 

@@ -206,7 +206,7 @@ def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
     ],
 )
 def test_outliers_in_a_row_of_one_place_have_one_reason(every_s, places, persist_s, share, count):
-    """Eight outliers, by turns of some places: how many that is. Else one view that errs for long is a move."""
+    """How many independent outliers eight count as that alternate between places. Else one long bad view is a move."""
     world = tagged_corridor(3)
     problem = solve_space(prepare_space(as_poses(world, 3), Config().slam.space), None).optimum.smoother.problem
     rows = np.arange(8)
