@@ -357,6 +357,20 @@ def _add_verdict(entered: Session, before: LivingMap, config: Config, found: tup
     return replace(entered, slam=_judge(entered.slam, entered.recording, config, expected, found, set_aside=reason))
 
 
+def refuse_localization(living: LivingMap, config: Config) -> None:
+    """Raise where nobody can localise in a map, whatever the recording.
+
+    Raises:
+        ConfigError: `slam.unknown_ids`: that is not causal.
+        DataError: the map is empty.
+    """
+    if config.slam.unknown_ids:
+        problem = "landmarks without identity are associated by what is seen later, which is not causal"
+        raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
+    if not len(living.places):
+        raise DataError("the map is empty", field="living", hint="enter a session first")
+
+
 @single_threaded()
 def run_localization(
     recording: AnyRecording,
@@ -382,11 +396,7 @@ def run_localization(
     from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
-    if config.slam.unknown_ids:
-        problem = "landmarks without identity are associated by what is seen later, which is not causal"
-        raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
-    if not len(living.places):
-        raise DataError("the map is empty", field="living", hint="enter a session first")
+    refuse_localization(living, config)
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     recording = check.valid(session.in_its_space(recording, living, config), config.sensor)  # type: ignore[type-var]
     recording, others = check.leave_out_riders(recording, config.slam)
