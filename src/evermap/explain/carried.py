@@ -44,8 +44,7 @@ class Carried(NamedTuple):
 
 
 def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, ...]:
-    """Return landmarks on no stated body that are carried about, by where their detections put them along the trajectory
-    of a result.
+    """Return landmarks on no stated body that are carried about, by where detections put them along a trajectory.
 
     Args:
         result: of the recording, or of one without some of its identities.
