@@ -22,7 +22,7 @@ from evermap.survival.text import parse_prior
 from evermap.tracking.detections import read_detections
 from evermap.tracking.field_of_view import find_field_of_view
 from evermap.tracking.frame import DetectionTable, p_real_of
-from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
+from evermap.tracking.record import Event, Followed, Recorder, StaticSpells, Tracks
 from evermap.tracking.standing import Stood, join_stood, standing
 from evermap.tracking.state_file import State, read_state
 from evermap.tracking.tracker import Tracker
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 FEW = 5
 """So many things by chance are no pattern."""
+IS_THERE = 0.5
+"""What is followed with at least this probability hides what is behind it."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -348,6 +350,7 @@ def _follow(
     sees = None if config.range_m is None else find_field_of_view(table, config)
     p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
     begin, parts, earlier = 0, list[Stood](), tracker.n_objects
+    followed: Followed | None = None
 
     def judge(end: int) -> None:
         if table.box is not None and end > begin:
@@ -367,6 +370,9 @@ def _follow(
         if config.range_m is not None and table.sensor_m is not None:
             around = centre_m, config.range_m, config.p_detect
             view = View.ball(*around) if sees is None else sees.view(k, *around)
+            if followed is not None and table.box is not None:
+                there = followed.p_exists >= IS_THERE  # also what is missed in this frame hides what is behind it
+                view = view.behind(followed.position_m[there], followed.box[there])
         found[rows], events = tracker.step(
             stamp_s,
             table.position_m[rows],
@@ -377,7 +383,8 @@ def _follow(
             appearance=None if table.appearance is None else table.appearance[rows],
             view=view,
         )
-        recorder.add(tracker.followed(), events)
+        followed = tracker.followed()
+        recorder.add(followed, events)
         if progress and k % 100 == 99:
             progress(k + 1, table.n_frames)
     judge(table.n_frames)
