@@ -79,6 +79,15 @@ def test_what_comes_out_from_behind_a_parked_car_has_not_arrived(sensor_z_m: flo
     assert len(list_ended(result)) == 0
 
 
+@pytest.mark.parametrize(("range_m", "why"), [(25.0, "not observed before"), (None, "without `range_m`")])
+def test_it_is_told_why_no_beginning_is_known(range_m: float | None, why: str) -> None:
+    """Without a range nothing is a look: who wants lifetimes has to state it."""
+    result = run_track(drive_past(1), CONFIG.model_copy(update={"range_m": range_m}))
+    (told,) = [remark for remark in result.warnings if "beginning has no bound" in remark]
+    assert why in told
+    assert told.startswith(f"{np.isinf(result.spells.elsewhere_s).sum()} spells")
+
+
 @pytest.mark.parametrize("sensor_z_m", [SENSOR_Z_M, 6.0])
 def test_what_leaves_is_gone_once_its_place_is_in_sight(sensor_z_m: float) -> None:
     result = run_track(drive_past(1, taken=TAKEN, sensor_z_m=sensor_z_m), CONFIG)

@@ -445,7 +445,10 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     unknown = int((~np.isfinite(spells.elsewhere_s)).sum())
     if unknown:
         what = f"{counted(unknown, 'spell')} whose beginning has no bound"
-        remarks.append(f"{what}, since the place was not observed before: in spells.csv, not in lifetimes.csv")
+        why = "since the place was not observed before"
+        if config.range_m is None:
+            why = "since without `range_m` no place is known to be observed"
+        remarks.append(f"{what}, {why}: in spells.csv, not in lifetimes.csv")
     return remarks
 
 
