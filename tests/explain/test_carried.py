@@ -166,3 +166,13 @@ def test_a_person_who_walks_slowly_is_found_and_one_who_leans_is_not() -> None:
     result = replace(result, trajectory=replace(path, covariance=0.01 * path.covariance))  # of a few millimetres
     found: list[AnyRecording] = [carry(make_plane(), how) for how in (stroll, lean)]
     assert [len(find_carried(result, each)) for each in found] == [1, 0]
+
+
+@pytest.mark.parametrize("make", [make_plane, make_space])
+def test_a_landmark_on_a_stated_body_is_not_carried_about(make: Any) -> None:
+    """A forklift with tags drives: that it moves is asked of the body, and what it does at rest is used."""
+    wrong, result = carry(make(), wander), run_slam(make())
+    on_a_body = replace(wrong, objects=np.array([[NAME, 0]]))
+    assert find_carried(result, in_its_space(wrong, Config().slam))
+    assert not find_carried(result, in_its_space(on_a_body, Config().slam))
+    assert CARRIED not in list_codes(run_slam(on_a_body))

@@ -44,7 +44,7 @@ class Carried(NamedTuple):
 
 
 def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, ...]:
-    """Return landmarks that are carried about, by where their detections put them along the trajectory of a result.
+    """Return landmarks on no stated body that are carried about, by where detections put them along a trajectory.
 
     Args:
         result: of the recording, or of one without some of its identities.
@@ -61,7 +61,8 @@ def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, 
     group: Any = se2 if pose.shape[1] == 3 else se3
     usable = near & np.isfinite(point_m).all(axis=1) & (recording.detections.landmark_id != UNKNOWN)
     name, count = np.unique(recording.detections.landmark_id[usable], return_counts=True)
-    often, found = name[count >= FEWEST], list[Carried]()
+    alone = ~np.isin(name, recording.objects[:, 0])  # a stated body is asked as a whole whether it moves
+    often, found = name[(count >= FEWEST) & alone], list[Carried]()
     for identity in often.tolist():
         rows = np.flatnonzero(usable & (recording.detections.landmark_id == identity))
         rows = rows[np.argsort(taken_s[rows], kind="stable")]
