@@ -207,7 +207,7 @@ def test_points_without_odometry_locate_the_robot_where_three_are_in_view():
     assert np.max(gap) < 0.1
 
 
-@pytest.mark.parametrize("odometry", [True, False])
+@pytest.mark.parametrize("odometry", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
     world = tagged_corridor(7, odometry=odometry)
     shift = {3: (0.3, 0.0, 0.0), 8: (0.0, -0.1, 0.4)}
@@ -219,9 +219,8 @@ def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
         assert told[tag].probability > 0.95
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(11, marks=pytest.mark.slow), 12, pytest.param(14, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12, 14])
 def test_what_was_moved_by_metres_draws_no_others_along(seed):
     """Nor is it another landmark of its identity. The others are moved by less, or not."""
     world = tagged_corridor(seed, drift=0.04, p_wrong=0.03, odometry=seed != 11)
@@ -429,7 +428,7 @@ def test_stamps_that_are_late_are_found(late_s):
     found = run_slam(late, config)
     delay = next(each for each in found.parameters if each.name.endswith("delay_s"))
     assert delay.value == pytest.approx(late_s, abs=0.03)
-    off = [evaluate_trajectory(run_slam(each, how).trajectory, recording.truth).rmse_m
-           for each, how in ((late, config), (late, trusted), (recording, trusted))]  # fmt: skip
+    believing = (run_slam(each, trusted) for each in (late, recording))
+    off = [evaluate_trajectory(one.trajectory, recording.truth).rmse_m for one in (found, *believing)]
     assert off[0] < 0.9 * off[1]
     assert off[0] < 1.5 * off[2]
