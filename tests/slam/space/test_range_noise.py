@@ -216,8 +216,10 @@ def test_lengths_are_not_too_short_by_noise_that_grows() -> None:
     ("law", "in_map"),
     [
         ("constant", False),
-        ("stereo", True),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("constant", True), ("stereo", False))),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in (("constant", True), ("stereo", False), ("stereo", True))
+        ),
     ],
 )
 def test_a_sensor_without_a_data_sheet_is_no_suspect(law: str, in_map: bool) -> None:
