@@ -28,7 +28,7 @@ def make(kind: str, **more: Any) -> Any:
 
 
 @pytest.mark.parametrize("in_map", [False, True])
-@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow), "poses"])
 def test_stamps_of_arrival_are_named_and_such_a_run_enters_no_map(kind: str, in_map: bool) -> None:
     given = make(kind)
     wrong = stamp_on_arrival(given, 0.08)
@@ -45,7 +45,7 @@ def test_stamps_of_arrival_are_named_and_such_a_run_enters_no_map(kind: str, in_
     "more",
     [{}, {"late_s": 0.15}, {"wheels": 1.1}, {"turns": 1.1}, {"longer": 1.1}, {"drift": 0.06}, {"bias_radps": 0.02}],
 )
-@pytest.mark.parametrize("kind", ["plane", "corners"])
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
 def test_what_lasts_or_is_each_landmarks_own_is_no_jitter(kind: str, more: dict[str, float]) -> None:
     given = make(kind, **more)
     result = run_slam(given)

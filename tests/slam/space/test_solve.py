@@ -207,7 +207,8 @@ def test_points_without_odometry_locate_the_robot_where_three_are_in_view():
     assert np.max(gap) < 0.1
 
 
-@pytest.mark.parametrize("odometry", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("odometry", [True, False])
 def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
     world = tagged_corridor(7, odometry=odometry)
     shift = {3: (0.3, 0.0, 0.0), 8: (0.0, -0.1, 0.4)}
@@ -416,7 +417,8 @@ def test_a_loop_that_stamps_all_it_logs_alike_hides_no_late_camera():
     assert not any(each.name.endswith("delay_s") for each in right.parameters)
 
 
-@pytest.mark.parametrize("late_s", [0.15, pytest.param(-0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("late_s", [0.15, -0.3])
 def test_stamps_that_are_late_are_found(late_s):
     """From the changes of speed of a drive around a hall, with points; and the path is that of the right stamps."""
     recording = hall(1, n_points=40, n_frames=300, drift=0.003)
