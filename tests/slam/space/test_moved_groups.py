@@ -92,6 +92,7 @@ def test_single_tags_that_moved_are_no_group():
     assert told[9,].rotation_rad == pytest.approx(0.5, abs=0.03)
 
 
+@pytest.mark.slow
 def test_two_tags_that_were_exchanged_are_each_where_the_other_was():
     world, order = tagged_corridor(3, drift=0.04), np.arange(12)
     order[[2, 9]] = 9, 2
