@@ -89,6 +89,7 @@ def test_half_of_a_building_has_names(share: float) -> None:
     check_names(found, some.detections.landmark_id, true)
 
 
+@pytest.mark.slow
 def test_tags_that_are_not_always_read() -> None:
     """Of half of the detections of each landmark the id is missing: they are of the same landmarks."""
     recording = building(2).sessions[0]
