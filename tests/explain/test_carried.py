@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,24 @@ def make_space(seed: int = 3) -> Any:
     return World(seed=seed).space(corners=False)
 
 
+@cache
+def solve(make: Callable[[], Any]) -> SlamResult:
+    return run_slam(make())
+
+
 def list_codes(result: SlamResult) -> list[str]:
     return [cause.code for cause in result.causes]
 
 
-@pytest.mark.parametrize("in_map", [False, True])
-@pytest.mark.parametrize("make", [make_plane, make_space])
+@pytest.mark.parametrize(
+    ("make", "in_map"),
+    [
+        (make_plane, False),
+        (make_plane, True),
+        (make_space, False),
+        pytest.param(make_space, True, marks=pytest.mark.slow),
+    ],
+)
 def test_what_is_carried_about_is_named_and_not_used(make: Any, in_map: bool) -> None:
     given = make()
     wrong = carry(given, wander)
@@ -98,14 +111,14 @@ def test_what_is_carried_about_is_named_and_not_used(make: Any, in_map: bool) ->
 def test_what_moves_between_two_places_is_not_carried_about(make: Any, how: Any) -> None:
     wrong = carry(make(), how)
     assert CARRIED not in list_codes(run_slam(wrong))
-    assert not find_carried(run_slam(make()), in_its_space(wrong, Config().slam))
+    assert not find_carried(solve(make), in_its_space(wrong, Config().slam))
 
 
 @pytest.mark.parametrize("size", [0.85, 1.3])
 def test_a_landmark_of_another_size_is_not_carried_about(size: float) -> None:
     """Its detections are too near or too far: along the drive they are at many places."""
     wrong = World(seed=3, sizes={NAME: size}).plane()
-    result = run_slam(make_plane())
+    result = solve(make_plane)
     at, radius_m = put_along(result, wrong)
     shares, elsewhere = _fill_places(at, radius_m)
     assert sum(shares[:2]) < AT_TWO  # as of what is carried about
@@ -128,14 +141,14 @@ def test_identities_that_are_misread_are_not_carried_about() -> None:
     rows, others = np.flatnonzero(name == NAME), np.flatnonzero(name != NAME)
     name[random.choice(rows, len(rows) // 2, replace=False)] = UNKNOWN
     name[random.choice(others, len(rows) // 2, replace=False)] = NAME
-    wrong, result = replace(given, detections=replace(seen, landmark_id=name)), run_slam(given)
+    wrong, result = replace(given, detections=replace(seen, landmark_id=name)), solve(make_plane)
     assert sum(_fill_places(*put_along(result, wrong))[0][:2]) < AT_TWO
     assert not find_carried(result, wrong)
 
 
 def test_of_many_landmarks_not_all_are_carried_about() -> None:
     """Where a few are, it is they; where more seem to be, it is the poses."""
-    given, result = make_plane(), run_slam(make_plane())
+    given, result = make_plane(), solve(make_plane)
     few, many = given, given
     for name in range(2):
         few = carry(few, wander, name)
@@ -146,7 +159,7 @@ def test_of_many_landmarks_not_all_are_carried_about() -> None:
 
 
 def test_where_poses_are_hardly_known_nothing_is_carried_about() -> None:
-    wrong, result = carry(make_plane(), wander), run_slam(make_plane())
+    wrong, result = carry(make_plane(), wander), solve(make_plane)
     path = result.trajectory
     vague = replace(result, trajectory=replace(path, covariance=path.covariance + np.eye(3)))
     assert find_carried(result, wrong)
@@ -154,7 +167,7 @@ def test_where_poses_are_hardly_known_nothing_is_carried_about() -> None:
 
 
 def test_a_person_who_walks_slowly_is_found_and_one_who_leans_is_not() -> None:
-    result = run_slam(make_plane())
+    result = solve(make_plane)
 
     def lean(stamp_s: np.ndarray) -> np.ndarray:
         return 0.14 * np.column_stack([np.sin(stamp_s), np.cos(stamp_s)])
