@@ -181,6 +181,18 @@ def test_a_person_who_walks_slowly_is_found_and_one_who_leans_is_not() -> None:
     assert [len(find_carried(result, each)) for each in found] == [1, 0]
 
 
+def test_looks_at_what_is_carried_fast_are_farther_apart() -> None:
+    """A third of a metre, of landmarks that are seen 2.5 times a second and carried at .8 m/s."""
+    given, result = make_plane(), solve(make_plane)
+    seen = given.detections
+    name = np.where((seen.landmark_id == NAME) & (seen.frame % 2 == 1), UNKNOWN, seen.landmark_id)
+    some = replace(given, detections=replace(seen, landmark_id=name))
+    wrong = carry(some, lambda stamp_s: np.column_stack([0.8 * stamp_s, 0.0 * stamp_s]))
+    at, radius_m = put_along(result, wrong)
+    assert np.median(np.linalg.norm(np.diff(at, axis=0), axis=1)) > radius_m[0]
+    assert [one.landmark_id for one in find_carried(result, wrong)] == [NAME]
+
+
 @pytest.mark.parametrize("make", [make_plane, make_space])
 def test_a_landmark_on_a_stated_body_is_not_carried_about(make: Any) -> None:
     """A forklift with tags drives: that it moves is asked of the body, and what it does at rest is used."""

@@ -27,6 +27,8 @@ AT_TWO, ELSEWHERE = 0.85, 5
 """Share of the sightings at the two places with most of them, at most, and how many are elsewhere, at least."""
 NEXT_S, JOINED = 1.0, 0.8
 """Time between sightings that follow each other, and the share of those elsewhere that must be near such a one."""
+WALKING_MPS = 1.0
+"""How fast things are carried: from one look to the next they come so far."""
 SURELY = 3.0
 """Standard deviations of the positions of poses within which a landmark is at one place."""
 SHARE = 0.2
@@ -103,8 +105,9 @@ def _fill_places(at: FloatArray, radius_m: FloatArray) -> tuple[list[float], Boo
 
 def _follow(at: FloatArray, radius_m: FloatArray, taken_s: FloatArray) -> BoolArray:
     """Return which sightings (N, D), in order of time, are near the one before or the one after, within a moment."""
-    near = np.linalg.norm(np.diff(at, axis=0), axis=1) < 0.5 * radius_m[:-1]
-    near &= np.diff(taken_s) <= NEXT_S
+    passed_s = np.diff(taken_s)
+    within_m = np.maximum(0.5 * radius_m[:-1], WALKING_MPS * passed_s)
+    near = (np.linalg.norm(np.diff(at, axis=0), axis=1) < within_m) & (passed_s <= NEXT_S)
     return np.asarray(np.append(near, False) | np.append(False, near))
 
 
