@@ -16,7 +16,7 @@ from evermap.explain.carried import APART_M, AT_TWO, CARRIED, ELSEWHERE, _fill_p
 from evermap.explain.expectations import find_instants, find_poses_at, locate_detections
 from evermap.geometry import se2
 from evermap.slam.plane import in_its_space
-from evermap.types import UNKNOWN, AnyRecording, SlamResult, VerdictKind
+from evermap.types import UNKNOWN, AnyRecording, ParameterEstimate, SlamResult, VerdictKind
 
 from .worlds import World
 
@@ -191,6 +191,33 @@ def test_looks_at_what_is_carried_fast_are_farther_apart() -> None:
     at, radius_m = put_along(result, wrong)
     assert np.median(np.linalg.norm(np.diff(at, axis=0), axis=1)) > radius_m[0]
     assert [one.landmark_id for one in find_carried(result, wrong)] == [NAME]
+
+
+@pytest.mark.parametrize("change", [{"bias_m": 0.3}, {"slope": 0.05}])
+def test_ranges_that_are_off_carry_nothing_about(change: dict[str, float]) -> None:
+    """Raw ranges put a landmark on a circle; the calibration that was estimated takes that off."""
+    given = make_plane()
+    seen = given.detections
+    read_m = change.get("bias_m", 0.0) + (1.0 + change.get("slope", 0.0)) * seen.range_m
+    result = run_slam(replace(given, detections=replace(seen, range_m=read_m)), prior_map=given.true_landmarks)
+    assert CARRIED not in list_codes(result)
+
+
+def test_detections_are_where_the_estimated_sensor_read_them() -> None:
+    """Readings of a sensor with every error that can be estimated in the plane."""
+    off = {
+        "range_bias_m": 0.2, "range_slope": 0.03, "range_skew_per_rad": 0.02, "range_curvature_per_rad2": 0.01,
+        "bearing_bias_rad": 0.1, "mount_forward_m": 0.3, "mount_left_m": -0.2,
+    }  # fmt: skip
+    given = make_plane()
+    mount = np.array(given.sensor.mount_robot_sensor) + [0.3, -0.2, 0.0]
+    point = np.random.default_rng(0).normal(0.0, 3.0, (len(given.detections), 2))
+    x, y = se2.transform(se2.inverse(mount), point).T
+    range_m, bearing = np.hypot(x, y), np.arctan2(y, x)
+    read_m = 0.2 + range_m * (1.03 + 0.02 * bearing + 0.01 * bearing**2)
+    read = replace(given.detections, range_m=read_m, bearing_rad=bearing + 0.1)
+    found = tuple(ParameterEstimate(name, value, 1e-3, 0.0, 1.0, "") for name, value in off.items())
+    np.testing.assert_allclose(locate_detections(replace(given, detections=read), found), point, atol=1e-9)
 
 
 @pytest.mark.parametrize("make", [make_plane, make_space])

@@ -58,7 +58,7 @@ def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, 
     usual, dim = float(np.median(compared.misfit[compared.used])), recording.dim
     variance = np.trace(result.trajectory.covariance[:, :dim, :dim], axis1=1, axis2=2)
     least_m = max(APART_M, SURELY * float(np.sqrt(np.median(variance))))
-    taken_s, point_m = find_instants(recording, result), locate_detections(recording)
+    taken_s, point_m = find_instants(recording, result), locate_detections(recording, result.parameters)
     pose, near = find_poses_at(result.trajectory, taken_s)
     group: Any = se2 if pose.shape[1] == 3 else se3
     usable = near & np.isfinite(point_m).all(axis=1) & (recording.detections.landmark_id != UNKNOWN)
