@@ -298,6 +298,7 @@ def run_session(
     """
     from evermap.maps.sessions import boxes, nameless, planar, session
     from evermap.slam import check
+    from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
@@ -317,7 +318,8 @@ def run_session(
         located = planar.localised(alone, living, config)
     found = (*riders, *found)
     entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
-    return _add_verdict(session.begun_with(entered, whole), living, config, found)
+    visit = None if has_traffic(whole) else located.visit
+    return _add_verdict(session.begun_with(entered, whole), visit, living, config, found)
 
 
 @single_threaded()
@@ -346,15 +348,42 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     from evermap.maps.sessions import planar, session
 
     living = session.with_names_of(living, alone.recording)
-    entered = session.brought_in(planar.localised(alone, living, config), living, config.living)
-    return _add_verdict(entered, living, config, alone.findings)
+    located = planar.localised(alone, living, config)
+    entered = session.brought_in(located, living, config.living)
+    return _add_verdict(entered, located.visit, living, config, alone.findings)
 
 
-def _add_verdict(entered: Session, before: LivingMap, config: Config, found: tuple[Finding, ...]) -> Session:
-    """Return a session with its verdict, beside the map as it was `before` it."""
+def _add_verdict(
+    entered: Session, visit: Visit | None, before: LivingMap, config: Config, found: tuple[Finding, ...]
+) -> Session:
+    """Return a session with its verdict, beside the map as it was `before` it; its solution, the `visit`, is asked what
+    it held as stated, but not in traffic (None).
+    """
+    from evermap.explain.causes.suspect import Inputs
+    from evermap.explain.scores import ScreenedSession
+    from evermap.maps.sessions import session
+
     expected = before.landmarks(p_least=0.0) if len(before.places) else None
     reason = entered.set_aside[0] if entered.set_aside else ""
-    return replace(entered, slam=_judge(entered.slam, entered.recording, config, expected, found, set_aside=reason))
+    asked = None
+    if visit is not None and entered.found and config.slam.explain.on:
+        asked = ScreenedSession(session.solution_of(visit), Inputs.of(visit.recording, None))
+    slam = _judge(entered.slam, entered.recording, config, expected, found, set_aside=reason, asked=asked)
+    return replace(entered, slam=slam)
+
+
+def refuse_localization(living: LivingMap, config: Config) -> None:
+    """Raise where nobody can localise in a map, whatever the recording.
+
+    Raises:
+        ConfigError: `slam.unknown_ids`: that is not causal.
+        DataError: the map is empty.
+    """
+    if config.slam.unknown_ids:
+        problem = "landmarks without identity are associated by what is seen later, which is not causal"
+        raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
+    if not len(living.places):
+        raise DataError("the map is empty", field="living", hint="enter a session first")
 
 
 @single_threaded()
@@ -382,11 +411,7 @@ def run_localization(
     from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
-    if config.slam.unknown_ids:
-        problem = "landmarks without identity are associated by what is seen later, which is not causal"
-        raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
-    if not len(living.places):
-        raise DataError("the map is empty", field="living", hint="enter a session first")
+    refuse_localization(living, config)
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     recording = check.valid(session.in_its_space(recording, living, config), config.sensor)  # type: ignore[type-var]
     recording, others = check.leave_out_riders(recording, config.slam)

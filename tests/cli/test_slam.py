@@ -347,9 +347,8 @@ def test_a_file_of_settings_may_hold_sections_of_other_recordings(in_space: bool
 @pytest.mark.parametrize(
     ("column", "in_space"),
     [
-        ("empty", False),
         ("absent", True),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("empty", True), ("absent", False))),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("empty", False), ("empty", True), ("absent", False))),
     ],
 )
 def test_a_recording_without_identities(column: str, in_space: bool, tmp_path: Path) -> None:

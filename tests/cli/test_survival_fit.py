@@ -158,6 +158,36 @@ def test_pooled_hazards_tell_where_nothing_was_at_risk(tmp_path: Path) -> None:
     assert sum(high > 0.01 for _, _, high in curve) > 40
 
 
+@pytest.mark.parametrize("estimator", ["npmle", "exponential", "best", "gp", "pooled"])
+def test_what_truncation_leaves_unknown_is_told_by_every_estimator(estimator: str, tmp_path: Path) -> None:
+    """Half live for hours, half for a month, and all are met at a day or later: no estimate knows of the hours."""
+    rng, day = np.random.default_rng(4), 86400.0
+    age = np.where(rng.random(3000) < 0.5, rng.exponential(2 * 3600.0, 3000), rng.exponential(30 * day, 3000))
+    entry = rng.uniform(day, 5 * day, 3000)
+    met = np.flatnonzero(age > entry)[:60]
+    left = entry[met] + np.floor((age - entry)[met] / day) * day
+    ends = left < 12 * day
+    rows = [
+        f"{a:.0f},{f'{a + day:.0f}' if end else ''},{e:.0f}"
+        for a, end, e in zip(left.tolist(), ends.tolist(), entry[met].tolist(), strict=True)
+    ]
+    path = tmp_path / "late.csv"
+    path.write_text("\n".join(["left,right,entry", *rows]) + "\n")
+    found = numbers(path, "--estimator", estimator)
+    stretch = 1.8 if estimator == "pooled" else 1.0  # its hazards are constant over stretches of age
+    first, last = float(np.rint(entry[met]).min()), float(np.rint(np.where(ends, left + day, left)).max())
+    assert first / stretch <= found["seen_from_s"] <= first
+    assert last <= found["seen_to_s"] + 1.0 <= last * stretch + 1.0
+    before = 100.0 * -math.expm1(parse_prior(found["prior"]).log_survival(found["seen_from_s"]))
+    (line,) = [line for line in run(path, "--estimator", estimator).stdout.splitlines() if "ages with data" in line]
+    assert f"that {before:.3g} % leave before is supposed, not seen" in line
+    path.write_text("left,right\n3600,7200\n7200,9000\n5000,\n")
+    few = numbers(path, "--estimator", estimator)
+    assert few["seen_from_s"] == 0.0
+    assert 9000.0 <= few["seen_to_s"] <= 9000.0 * stretch
+    assert "supposed" not in run(path, "--estimator", estimator).stdout
+
+
 def write_nights(path: Path, began: bool) -> None:
     """Carts that leave at night only, pallets that leave at any hour, looked at six times a day for four weeks."""
     rng, day, start = np.random.default_rng(1), 86400.0, 1_693_440_000.0  # a Thursday, 00:00

@@ -99,9 +99,10 @@ def longest_first(pages: list[Path]) -> list[Path]:
 
 
 @pytest.fixture(scope="session")
-def warm() -> Iterator[dict[str, str]]:
-    """The environment in which `evermap` is ready, see there."""
-    with warm_commands(environment()) as ready:
+def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """The environment in which `evermap` is ready, see there; one for all processes of the run."""
+    folder = tmp_path_factory.getbasetemp()
+    with warm_commands(environment(), folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) as ready:
         yield ready
 
 

@@ -8,8 +8,10 @@ starts in a fresh process is what the README's commands show, which are run with
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import shutil
 import signal
 import socket
 import stat
@@ -34,22 +36,44 @@ with socket.socket(socket.AF_UNIX) as to:
 
 
 @contextmanager
-def warm_commands(environment: dict[str, str]) -> Iterator[dict[str, str]]:
-    """Yield the environment in which `evermap` is a fork of a process that is ready; it ends with the block."""
-    with tempfile.TemporaryDirectory(prefix="evermap-warm-") as folder:
-        address, shim = Path(folder, "socket"), Path(folder, "bin", "evermap")
-        shim.parent.mkdir()
-        shim.write_text(SHIM.format(python=sys.executable, address=str(address)), encoding="utf-8")
-        shim.chmod(shim.stat().st_mode | stat.S_IXUSR)
-        with subprocess.Popen(
-            [sys.executable, __file__, str(address)], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
-        ) as process:
-            try:
-                assert process.stdout is not None
-                assert process.stdout.readline() == "ready\n"
-                yield {**environment, "PATH": os.pathsep.join([str(shim.parent), environment["PATH"]])}
-            finally:
-                process.terminate()
+def warm_commands(environment: dict[str, str], shared: Path) -> Iterator[dict[str, str]]:
+    """Yield the environment in which `evermap` is a fork of a process that is ready.
+
+    Processes of tests that give the same folder share one: the first starts it, and ends it when all left the block.
+    """
+    where, process = shared / "warm.txt", None
+    with (shared / "warm-start.lock").open("a") as start, (shared / "warm-users.lock").open("a") as users:
+        fcntl.flock(start, fcntl.LOCK_EX)
+        if not where.exists():
+            folder = Path(tempfile.mkdtemp(prefix="evermap-warm-"))
+            process = _begin(folder, environment)
+            where.write_text(str(folder), encoding="utf-8")
+        fcntl.flock(users, fcntl.LOCK_SH)
+        fcntl.flock(start, fcntl.LOCK_UN)
+        try:
+            yield {**environment, "PATH": os.pathsep.join([where.read_text(encoding="utf-8"), environment["PATH"]])}
+        finally:
+            fcntl.flock(users, fcntl.LOCK_UN)
+            if process is not None:
+                fcntl.flock(start, fcntl.LOCK_EX)  # nobody joins while it waits for the others
+                fcntl.flock(users, fcntl.LOCK_EX)
+                where.unlink()
+                with process:
+                    process.terminate()
+                shutil.rmtree(folder)
+
+
+def _begin(folder: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
+    """Start the process that answers, and put the command that asks it into the folder."""
+    address, shim = folder / "socket", folder / "evermap"
+    shim.write_text(SHIM.format(python=sys.executable, address=str(address)), encoding="utf-8")
+    shim.chmod(shim.stat().st_mode | stat.S_IXUSR)
+    process = subprocess.Popen(
+        [sys.executable, __file__, str(address)], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
 
 
 def prepare() -> None:

@@ -521,7 +521,7 @@ def test_of_a_mirrored_map_and_clockwise_readings_one_is_wrong_and_nothing_says_
         assert result.changes == ()
 
 
-@pytest.mark.parametrize("wrong", ["forward speeds", "units"])
+@pytest.mark.parametrize("wrong", ["forward speeds", pytest.param("units", marks=pytest.mark.slow)])
 def test_a_mirrored_map_is_found_beside_another_mistake(wrong: str) -> None:
     """Whose shape of the session is wrong, too; and which of all readings and the map is mirrored stays open."""
     recording = World(seed=4, seconds=20.0).plane()

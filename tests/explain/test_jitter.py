@@ -28,7 +28,7 @@ def make(kind: str, **more: Any) -> Any:
 
 
 @pytest.mark.parametrize("in_map", [False, True])
-@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow), "poses"])
 def test_stamps_of_arrival_are_named_and_such_a_run_enters_no_map(kind: str, in_map: bool) -> None:
     given = make(kind)
     wrong = stamp_on_arrival(given, 0.08)
@@ -45,7 +45,7 @@ def test_stamps_of_arrival_are_named_and_such_a_run_enters_no_map(kind: str, in_
     "more",
     [{}, {"late_s": 0.15}, {"wheels": 1.1}, {"turns": 1.1}, {"longer": 1.1}, {"drift": 0.06}, {"bias_radps": 0.02}],
 )
-@pytest.mark.parametrize("kind", ["plane", "corners"])
+@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow)])
 def test_what_lasts_or_is_each_landmarks_own_is_no_jitter(kind: str, more: dict[str, float]) -> None:
     given = make(kind, **more)
     result = run_slam(given)
@@ -73,10 +73,11 @@ def test_the_more_stamps_vary_the_more_is_found() -> None:
     for sigma_s in (0.01, 0.02):
         late_s = sigma_s * random.choice([-1.0, 1.0], len(given.frames))
         wrong = replace(given, frames=replace(given.frames, stamp_s=given.frames.stamp_s + late_s))
-        jitter = measure_jitter(run_slam(wrong), wrong)
+        result = run_slam(wrong)
+        jitter = measure_jitter(result, wrong)
         assert jitter is not None
         found.append(jitter.sigma_s)
-        assert bool(find_jitter(run_slam(wrong), wrong)) == (sigma_s > LEAST_S)
+        assert bool(find_jitter(result, wrong)) == (sigma_s > LEAST_S)
         assert jitter.surely > SURELY
     assert found == pytest.approx([0.01, 0.02], rel=0.3)
 
@@ -108,12 +109,13 @@ def test_a_little_jitter_beside_the_noise_of_detections_is_let_be() -> None:
     wrong = replace(
         given, detections=replace(seen, bearing_rad=noisy, range_m=seen.range_m * (1.0 + noisy - seen.bearing_rad))
     )
-    jitter = measure_jitter(run_slam(wrong), wrong)
+    result = run_slam(wrong)
+    jitter = measure_jitter(result, wrong)
     assert jitter is not None
     assert jitter.surely > SURELY
     assert jitter.sigma_s > LEAST_S
     assert jitter.share < LEAST_SHARE
-    assert not find_jitter(run_slam(wrong), wrong)
+    assert not find_jitter(result, wrong)
 
 
 def test_of_few_frames_jitter_is_not_certain() -> None:

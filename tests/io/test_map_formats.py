@@ -25,6 +25,7 @@ from evermap.io.map_formats import (
     format_of,
     read_landmarks,
     read_map_file,
+    write_corrected,
     write_map,
     write_map_bytes,
 )
@@ -308,6 +309,23 @@ def test_a_map_of_a_newer_layout_is_gzipped_where_its_name_says_so(tmp_path: Pat
     assert data.decode() == SURVEY.replace("0.5890", "0.6000")
     other = write_map_bytes(data, tmp_path / "new.csv.gz")
     assert gzip.decompress(other.read_bytes()) == data
+
+
+def test_a_packed_map_of_which_nothing_is_wrong_is_the_same_to_the_last_byte(tmp_path: Path) -> None:
+    """Packed again it would be others: another level, name and time are in it."""
+    path = tmp_path / "survey.csv.gz"
+    path.write_bytes(gzip.compress(SURVEY.encode(), 1, mtime=7))
+    file = read_map_file(path)
+    assert write_corrected(file, [], tmp_path / "same.csv.gz").read_bytes() == path.read_bytes()
+    assert write_corrected(file, [], tmp_path / "unpacked.csv").read_bytes() == SURVEY.encode()
+    one = Correction(0, position_m=np.array([0.6, 19.26, 2.289]))
+    packed = write_corrected(file, [one], tmp_path / "new.csv.gz").read_bytes()
+    assert gzip.decompress(packed) == correct_map(file, [one])
+    plain = tmp_path / "survey.csv"
+    plain.write_bytes(SURVEY.encode())
+    assert gzip.decompress(write_corrected(read_map_file(plain), [], tmp_path / "other.csv.gz").read_bytes()) == (
+        SURVEY.encode()
+    )
 
 
 @pytest.mark.parametrize(

@@ -434,7 +434,7 @@ def test_a_clock_that_hiccups_is_not_followed_and_one_that_is_set_is() -> None:
     assert not now.lost
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_whatever_comes_in_is_taken_or_refused_in_one_line(tmp_path: Path, two_sessions: Path, seed: int) -> None:
     """Late, twice, never, of no time, no numbers: the drive goes on, and enters the map."""
     rng, recording, path = np.random.default_rng(seed), SESSIONS[2], copied(two_sessions, tmp_path)

@@ -12,7 +12,7 @@ from evermap.config import LivingConfig
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.rhythm import BINS, DAY_S, MONDAY_S, WEEK_S
 from evermap.maps.learning import ClassLives, with_priors
-from evermap.maps.lives import Lives, describe_hours
+from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.maps.sessions.believe import aged
 from evermap.maps.store.content import flaw, pack, unpack
@@ -98,10 +98,10 @@ def test_a_map_forecasts_by_the_hour(clock: Clock) -> None:
     assert evening[1] == pytest.approx(np.exp(-10.0 * HOUR_S / MEAN_S), abs=0.04)
     plain = aged(living, LivingConfig(learn_lifetimes=False), living.stamp_s + 10.0 * HOUR_S).p_here
     assert plain[0] == plain[1]
-    line = describe_hours(lives, clock, 0)[0]
+    line = lives.describe_hours(clock, 0)[0]
     assert ("UTC" in line) == (clock is Clock.UNIX)
     assert int(line.split(":00")[0][-2:]) in (20, 21, 22, 23, 0, 1, 2, 3, 4, 5)
-    assert describe_hours(lives, clock, 1) == [
+    assert lives.describe_hours(clock, 1) == [
         "stays of its class do not follow the hours of the week that others follow"
     ]
     found = hours_dict(living)["hours"]
@@ -119,7 +119,7 @@ def test_without_hours_of_the_week_everything_is_as_before() -> None:
     lives = learn(stays, look_s, Clock.RECORDING)
     assert not len(lives.log_factor)
     assert not len(lives.hours_known)
-    assert describe_hours(lives, Clock.RECORDING) == []
+    assert lives.describe_hours(Clock.RECORDING) == []
     living = make_map(lives, stays, float(look_s[-1]), Clock.RECORDING)
     assert hours_dict(living) == {}
     assert b"log_factor" not in pack(living)[1][pack(living)[0]].raw
@@ -138,7 +138,7 @@ def test_no_rhythm_leaves_all_lifetimes_as_they_are() -> None:
     assert not len(asked.log_factor)
     assert asked.hours_known[0] > 100.0
     assert asked.hours_known[1] < 1.0
-    assert describe_hours(asked, Clock.UNIX)[0].startswith("stays end at all hours of the week alike")
+    assert asked.describe_hours(Clock.UNIX)[0].startswith("stays end at all hours of the week alike")
 
 
 def test_looks_at_noon_leave_the_hours_open() -> None:
@@ -146,7 +146,7 @@ def test_looks_at_noon_leave_the_hours_open() -> None:
     lives = learn(stays, look_s, Clock.UNIX)
     assert not len(lives.log_factor)
     assert lives.hours_known[0] < 1.0
-    assert describe_hours(lives, Clock.UNIX)[0].startswith("at which hour of the day stays end is open")
+    assert lives.describe_hours(Clock.UNIX)[0].startswith("at which hour of the day stays end is open")
 
 
 def test_a_stated_lifetime_is_by_age_on_the_wall_where_none_of_its_class_ended() -> None:

@@ -168,6 +168,7 @@ def test_a_landmark_whose_first_sighting_was_misread_is_where_all_others_say(see
     assert off_m.max() < 0.5
 
 
+@pytest.mark.slow
 def test_ranges_in_millimetres_are_told_and_go_through():
     recording = judged(1).recording
     seen = recording.detections

@@ -129,7 +129,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 ENDINGS = (".bag", ".mcap", ".db3")
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap", "sqlite"])
+@pytest.mark.parametrize("kind", ["ros1", pytest.param("mcap", marks=pytest.mark.slow), "sqlite"])
 def test_a_bag_is_read_as_it_is_and_in_a_zip(bags: dict[str, Path], kind: str) -> None:
     path, limits = bags[kind], UploadLimits()
     data, wanted = path.read_bytes(), read_bag(path)

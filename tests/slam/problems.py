@@ -180,7 +180,7 @@ def make_world(
     seen[0, :2] = True
     seen[1:, 0] |= ~seen[1:].any(axis=1)
     seen[-1] = True
-    pose_row, landmark_row = np.nonzero(seen)
+    pose_row, landmark_row = map(np.ascontiguousarray, np.nonzero(seen))
     reading = slow_detection(pose[pose_row], landmark[landmark_row], states, mount)
     reading += noisy * noise.detection * rng.normal(size=reading.shape)
     wrong = rng.random(len(reading)) < p_outlier

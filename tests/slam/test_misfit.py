@@ -90,7 +90,7 @@ def test_independent_residuals_show_no_curves():
     assert np.mean(np.array(found) > 0.0) < np.exp(-CURVED) + 0.1
 
 
-@pytest.mark.parametrize("kind", [None, SensorKind.LASER])
+@pytest.mark.parametrize("kind", [pytest.param(None, marks=pytest.mark.slow), SensorKind.LASER])
 def test_a_range_that_bends_is_taken_for_no_offset(kind):
     """An offset of -12 mm +- 1 is found if the law of ranges is taken for exact, and everything is off by 1.7 times.
 

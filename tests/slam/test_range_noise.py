@@ -104,7 +104,7 @@ def test_noise_that_is_not_to_be_learned_is_not() -> None:
         assert solved(other).problem.noise_shape is None
 
 
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow)])
 def test_lengths_of_inverse_ranges_have_no_bias(seed: int) -> None:
     """A stereo pair measures these: by expected ranges alone lengths are too long, by measured ones too short."""
     recording = recorded(seed, None, inverse_m=0.015)
@@ -117,7 +117,7 @@ def test_lengths_of_inverse_ranges_have_no_bias(seed: int) -> None:
     assert scale == pytest.approx(1.0, abs=0.003)
 
 
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_stereo_pair_without_a_data_sheet_is_no_suspect(seed: int) -> None:
     """By one level its ranges are eight times as noisy as sensors usually are, though the nearest are good."""
     recording = recorded(seed, None, inverse_m=0.01)

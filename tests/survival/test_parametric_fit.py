@@ -147,7 +147,15 @@ def test_mixtures_find_a_maximum_that_a_global_search_does_not_beat(kind: str, t
     assert mine.loglik >= log_likelihood(truth, data).sum()
 
 
-@pytest.mark.parametrize("truth", [Weibull(3.0, 3.0), LogNormal(1.0, 2.0), MIXED, LEAVING], ids=str)
+@pytest.mark.parametrize(
+    "truth",
+    [
+        *(pytest.param(truth, marks=pytest.mark.slow) for truth in (Weibull(3.0, 3.0), MIXED)),
+        LogNormal(1.0, 2.0),
+        LEAVING,
+    ],
+    ids=str,
+)
 def test_the_best_is_the_family_of_the_truth(truth: LifetimePrior) -> None:
     data = intervals(truth, 6, 0.7)
     best = fit_best(data)

@@ -149,6 +149,40 @@ def test_misses_that_come_together_are_told() -> None:
         assert not any("come together" in remark for remark in right.warnings)
 
 
+@pytest.mark.parametrize("objects_m", [RING[::3], RING[:2]], ids=["four around", "two ahead"])
+def test_misses_of_what_is_seen_too_briefly_to_rest_are_told(objects_m: FloatArray) -> None:
+    """A camera that turns fast over few objects, of which nothing but the range is stated: each is seen for a second a
+    turn, dies, and is another one. Who walks by leaves nothing in the place.
+    """
+    fast = table_of(objects_m, 0.6 * 0.1 * np.arange(1800), np.radians(40.0), yaw=False)
+    result = run_track(fast, CONFIG)
+    assert died(result) > 30
+    assert len(result.spells) == 0
+    (remark,) = [remark for remark in result.warnings if "misses come together" in remark]
+    again, left = (int(word) for word in remark.split() if word.isdigit())
+    assert 0.9 * died(result) < again <= left == died(result)
+    passed = run_track(walk_by(), CONFIG)
+    assert died(passed) > 15
+    assert not any("come together" in remark for remark in passed.warnings)
+
+
+def walk_by() -> DetectionTable:
+    """Twenty people, one after the other, past a sensor that sees all around; each begins where the last one ended."""
+    table = table_of(np.array([[3.0, 0.0, 0.0]]), np.zeros(1200), 2.0 * np.pi, yaw=False)
+    frame = np.repeat(np.arange(table.n_frames), np.diff(table.first))
+    away = frame % 60 > 35
+    there = (0.15 * (frame % 60) - 2.6) * np.where(frame // 60 % 2, -1.0, 1.0)
+    at = table.position_m + np.column_stack([np.zeros(len(frame)), there, np.zeros(len(frame))])
+    counts = np.bincount(frame[~away], minlength=table.n_frames)
+    return replace(
+        table,
+        first=np.concatenate([[0], np.cumsum(counts)]),
+        position_m=at[~away],
+        class_id=table.class_id[~away],
+        line=table.line[~away],
+    )
+
+
 def test_the_smallest_sector_holds_all() -> None:
     random = np.random.default_rng(3)
     for n in (1, 2, 7):

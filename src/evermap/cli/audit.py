@@ -68,7 +68,7 @@ def audit(
     chosen = configured(config, settings, {}, within="slam", also=("living", "sensor", "track"))
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.io import read_recording
-    from evermap.io.map_formats import correct_map, read_map_file, write_map_bytes
+    from evermap.io.map_formats import read_map_file, write_corrected
     from evermap.runs.audit.report import (
         HEAD,
         conclude,
@@ -103,7 +103,7 @@ def audit(
 
         found = audit_map(file.landmarks, drives, chosen, progress=progress)
     if write is not None:
-        write_map_bytes(correct_map(file, found.corrections()), write)
+        write_corrected(file, found.corrections(), write)
     info = RunInfo(command=command_line(), total_s=time.perf_counter() - start)
     summary = write_audit(folder, found, file, info, force=force, inputs=inputs)
     verdict, message = conclude(found)

@@ -210,7 +210,7 @@ def _run_in_map(
     from evermap.existence.models import priors_of
     from evermap.maps.sessions.session import in_its_space
     from evermap.maps.store import open_store
-    from evermap.pipeline import run_localization
+    from evermap.pipeline import refuse_localization, run_localization
     from evermap.runs.sessions import at_time, begin_map, enter_session
     from evermap.slam.check import odd, valid
     from evermap.slam.space.moving import has_traffic
@@ -241,14 +241,16 @@ def _run_in_map(
         refuse_unread(asked, in_space=in_space, boxes=has_traffic(recording))
         if asked.realtime and in_space:
             raise ConfigError("a session is solved when it ends", field="realtime", hint="leave it out")
+        stamps = recording.frames.stamp_s
+        living = at_time(store, float(stamps[0]) if len(stamps) else 0.0) if localize else None
+        if living is not None:  # before anything is compiled
+            refuse_localization(living, config)
         warm_up(
             lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space)
         )
         try:
             with progress_bar(recording.name) as progress:
-                if localize:
-                    stamps = recording.frames.stamp_s
-                    living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
+                if living is not None:
                     result = run_localization(recording, living, config, realtime=asked.realtime, progress=progress)
                 else:
                     entered = enter_session(store, recording, config, priors=said, later=others, progress=progress)

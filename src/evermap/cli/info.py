@@ -191,7 +191,6 @@ def _topics(path: Path) -> dict[str, tuple[str, int]]:
 def _map(path: Path) -> Described:
     from evermap.cli.map import revision_row
     from evermap.maps.diff import read_log
-    from evermap.maps.lives import describe_hours
     from evermap.maps.store import open_store
     from evermap.runs.map_dicts import life_dicts, revision_dict
     from evermap.types import json_number, stamp_text
@@ -212,7 +211,7 @@ def _map(path: Path) -> Described:
         ("landmarks", f"{len(living.members):,} known, {len(landmarks):,} believed to exist"),
         *_landmark_rows(landmarks),
         *((f"stay of {life['class'] or 'all'}", _half(life["half_gone_s"], life["stays"])) for life in everywhere),
-        *(("hours", line) for line in describe_hours(living.lives, living.clock)),
+        *(("hours", line) for line in living.lives.describe_hours(living.clock)),
     ]
     facts = {
         "revisions": len(revisions),

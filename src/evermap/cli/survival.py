@@ -263,7 +263,7 @@ def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
     import numpy as np
 
     left, right, entry = (getattr(table.data, name)[group.rows] for name in ("left_s", "right_s", "entry_s"))
-    exact = left == right
+    exact, (seen_from_s, seen_to_s) = left == right, table.data[group.rows].at_risk_s
     return {
         "samples": len(group.rows),
         "weight": float(table.data.weight[group.rows].sum()),
@@ -271,6 +271,8 @@ def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
         "intervals": int((np.isfinite(right) & ~exact).sum()),
         "never_seen_gone": int(np.isinf(right).sum()),
         "truncated": int((entry > 0.0).sum()),
+        "seen_from_s": seen_from_s,
+        "seen_to_s": seen_to_s,
     }
 
 
@@ -295,6 +297,7 @@ def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) 
         ("stays", f"{counts['samples']:,}, each of one object at one place"),
         ("their ends", f"{ends}, {counts['never_seen_gone']:,} never seen"),
         ("estimator", found.estimator),
+        ("ages with data", _ages_with_data({**counts, **found.numbers}, found.prior)),
     ]
     if "loglik" in found.numbers:
         lines.append(("log likelihood", f"{found.numbers['loglik']:.6g}"))
@@ -303,6 +306,18 @@ def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) 
     if len(found.text) < 80:
         lines.append(("prior", found.text))
     return [*lines, *lifetime_lines(lifetime_numbers(found.prior))]
+
+
+def _ages_with_data(numbers: Mapping[str, Any], prior: LifetimePrior) -> str:
+    """Return between which ages an end would have been seen, and how many leave before by what is not in the table."""
+    from evermap.survival.durations import duration_text
+
+    from_s, to_s = numbers["seen_from_s"], numbers["seen_to_s"]
+    until = "any" if to_s is None else duration_text(to_s)
+    if not from_s:
+        return f"up to {until}"
+    share = -math.expm1(float(prior.log_survival(from_s)))
+    return f"{duration_text(from_s)} to {until}; that {100.0 * share:.3g} % leave before is supposed, not seen"
 
 
 def _learned_lines(choice: Choice) -> list[tuple[str, str]]:

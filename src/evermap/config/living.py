@@ -51,7 +51,7 @@ class OverlayConfig(RoomConfig):
     free_rad: Positive = rule(3.0, "the same of its heading [rad]")
     stood_rad: tuple[Positive, ...] = rule(
         (0.02, 0.06, 0.15),
-        "standard deviations of a common apparent turn of unmoved landmarks in space [rad]",
+        "standard deviations of apparent turns of unmoved landmarks in space, one for all of a session [rad]",
         min_length=1,
     )
     turned_rad: tuple[Positive, ...] = rule((0.2, 1.0), "the same of landmarks that were moved [rad]", min_length=1)

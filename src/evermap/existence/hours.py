@@ -38,10 +38,11 @@ from evermap.survival.base import LifetimePrior
 from evermap.survival.hazard_posterior import HazardPosterior
 from evermap.survival.logmath import log_sum_exp
 from evermap.survival.newton import climb, drop_negative, log_determinant
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, Clock, FloatArray, IntArray
 
 HOUR_S = 3600.0
 HOURS = 168
+DAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
 LONGEST_S = 4.0 * WEEK_S
 """An end within longer has no hour; later in a stay every hour counts alike."""
 LEAST_ENDS = 20.0
@@ -115,6 +116,34 @@ class HourFit:
             return stamp_s
         follows = self.follows[group].reshape(-1, *(1,) * (np.ndim(stamp_s) - 1))
         return np.where(follows, self.rhythm.count_s(stamp_s), stamp_s)
+
+
+def describe_hours(
+    n_dated: float, log_evidence: float, rhythm: Rhythm | None, clock: Clock, *, follows: bool = True
+) -> list[str]:
+    """Return lines on what is known of the hours of the week at which stays end.
+
+    Args:
+        n_dated: ends of a known hour of the day that the looks are worth.
+        log_evidence: for a common factor, against none [nats].
+        rhythm: the common factor; None where there is none.
+        clock: what stamps count.
+        follows: whether the stays that this is about follow it.
+    """
+    unknown = f"at which hour of the day stays end is open: looks are worth {n_dated:.1f} ends of a known hour"
+    if rhythm is None:
+        none = f"stays end at all hours of the week alike (evidence for a rhythm {log_evidence:.1f} nats)"
+        return [none if n_dated >= LEAST_ENDS else unknown]
+    if not follows:
+        return ["stays of its class do not follow the hours of the week that others follow"]
+    factor, zone = rhythm.hourly_factor, " UTC" if clock is Clock.UNIX else ""
+    most, least = (
+        f"{DAYS[at // 24]} {at % 24:02d}:00{zone} ({factor[at]:.2g})"
+        for at in (int(factor.argmax()), int(factor.argmin()))
+    )
+    line = f"stays end by the hours of the week, most often on {most}, least often on {least} times the mean rate"
+    line += f" (evidence {log_evidence:.1f} nats)"
+    return [line] if n_dated >= LEAST_ENDS else [line, unknown]
 
 
 Posteriors = Sequence[HazardPosterior]

@@ -54,6 +54,11 @@ class Rhythm(Shown):
         """(1008,) by what the hazard is multiplied."""
         return np.asarray(np.exp(self.log_factor), dtype=np.float64)
 
+    @property
+    def hourly_factor(self) -> FloatArray:
+        """(168,) the same, on average over each hour."""
+        return np.asarray(self.factor.reshape(7 * 24, -1).mean(axis=1))
+
     def count_s(self, stamp_s: ArrayLike) -> FloatArray:
         """Return the integral (...) of the factor from a Monday 00:00 until stamps (...): a clock that runs as fast as
         things happen. What is not finite stays as it is.

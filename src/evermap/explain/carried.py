@@ -27,6 +27,8 @@ AT_TWO, ELSEWHERE = 0.85, 5
 """Share of the sightings at the two places with most of them, at most, and how many are elsewhere, at least."""
 NEXT_S, JOINED = 1.0, 0.8
 """Time between sightings that follow each other, and the share of those elsewhere that must be near such a one."""
+WALKING_MPS = 1.0
+"""How fast things are carried: from one look to the next they come so far."""
 SURELY = 3.0
 """Standard deviations of the positions of poses within which a landmark is at one place."""
 SHARE = 0.2
@@ -44,7 +46,7 @@ class Carried(NamedTuple):
 
 
 def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, ...]:
-    """Return landmarks that are carried about, by where their detections put them along the trajectory of a result.
+    """Return landmarks on no stated body that are carried about, by where detections put them along a trajectory.
 
     Args:
         result: of the recording, or of one without some of its identities.
@@ -56,12 +58,13 @@ def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, 
     usual, dim = float(np.median(compared.misfit[compared.used])), recording.dim
     variance = np.trace(result.trajectory.covariance[:, :dim, :dim], axis1=1, axis2=2)
     least_m = max(APART_M, SURELY * float(np.sqrt(np.median(variance))))
-    taken_s, point_m = find_instants(recording, result), locate_detections(recording)
+    taken_s, point_m = find_instants(recording, result), locate_detections(recording, result.parameters)
     pose, near = find_poses_at(result.trajectory, taken_s)
     group: Any = se2 if pose.shape[1] == 3 else se3
     usable = near & np.isfinite(point_m).all(axis=1) & (recording.detections.landmark_id != UNKNOWN)
     name, count = np.unique(recording.detections.landmark_id[usable], return_counts=True)
-    often, found = name[count >= FEWEST], list[Carried]()
+    alone = ~np.isin(name, recording.objects[:, 0])  # a stated body is asked as a whole whether it moves
+    often, found = name[(count >= FEWEST) & alone], list[Carried]()
     for identity in often.tolist():
         rows = np.flatnonzero(usable & (recording.detections.landmark_id == identity))
         rows = rows[np.argsort(taken_s[rows], kind="stable")]
@@ -102,8 +105,9 @@ def _fill_places(at: FloatArray, radius_m: FloatArray) -> tuple[list[float], Boo
 
 def _follow(at: FloatArray, radius_m: FloatArray, taken_s: FloatArray) -> BoolArray:
     """Return which sightings (N, D), in order of time, are near the one before or the one after, within a moment."""
-    near = np.linalg.norm(np.diff(at, axis=0), axis=1) < 0.5 * radius_m[:-1]
-    near &= np.diff(taken_s) <= NEXT_S
+    passed_s = np.diff(taken_s)
+    within_m = np.maximum(0.5 * radius_m[:-1], WALKING_MPS * passed_s)
+    near = (np.linalg.norm(np.diff(at, axis=0), axis=1) < within_m) & (passed_s <= NEXT_S)
     return np.asarray(np.append(near, False) | np.append(False, near))
 
 

@@ -87,16 +87,19 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     off = (read - expected) / np.maximum(range_m, 1e-9)[:, None]
     good = np.isfinite(off).all(axis=1)
     named, used = innovations.landmark_id[keep[good]], innovations.p_inlier[keep[good]] >= USED
-    point = locate_detections(recording)[detection[good]]
+    point = locate_detections(recording, result.parameters)[detection[good]]
     return Compared(detection[good], taken_s[keep[good]], named, used, range_m[good], off[good], point)
 
 
-def locate_detections(recording: AnyRecording) -> FloatArray:
-    """Return (M, D) where detections are in the robot's frame [m]; nan of those with a direction or a range only."""
+def locate_detections(recording: AnyRecording, parameters: tuple[ParameterEstimate, ...] = ()) -> FloatArray:
+    """Return (M, D) where detections are in the robot's frame [m]; nan of those with a direction or a range only.
+
+    `parameters` in the plane are the estimated calibration, which is taken off.
+    """
     if not is_in_space(recording):
         seen = recording.detections
-        read = _points(seen.range_m, np.where(_has_bearing(recording), seen.bearing_rad, np.nan))
-        return np.asarray(se2.transform(np.array(recording.sensor.mount_robot_sensor, dtype=np.float64), read))
+        bearing = np.where(_has_bearing(recording), seen.bearing_rad, np.nan)
+        return np.asarray(se2.transform(*_correct_readings(seen.range_m, bearing, recording, parameters)))
     from evermap.slam.space.intake import positions_of, without_range
 
     mounts = np.array([one.mount_robot_sensor for one in recording.sensors])[recording.detections.sensor]
@@ -145,15 +148,41 @@ def _predict_readings(
     pose: FloatArray, place_m: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
 ) -> FloatArray:
     """Return (K, 2) ranges and bearings as the estimated sensor reads them without noise (`slam.calibration.SPECS`)."""
-    value = {each.name: each.value for each in parameters}
-    ahead, left = value.get("mount_forward_m", 0.0), value.get("mount_left_m", 0.0)
-    mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64) + [ahead, left, 0.0]
-    x, y = se2.transform(se2.inverse(se2.compose(pose, mount)), place_m).T
+    value = _PlanarCalibration(parameters)
+    x, y = se2.transform(se2.inverse(se2.compose(pose, value.find_mount(recording))), place_m).T
     range_m, bearing = np.hypot(x, y), np.arctan2(y, x)
-    skew, curve = value.get("range_skew_per_rad", 0.0), value.get("range_curvature_per_rad2", 0.0)
-    factor = 1.0 + value.get("range_slope", 0.0) + skew * bearing + curve * bearing**2
-    read_m = value.get("range_bias_m", 0.0) + range_m * factor
-    return np.column_stack([np.maximum(read_m, 1e-3), bearing + value.get("bearing_bias_rad", 0.0)])
+    read_m = value["range_bias_m"] + range_m * value.find_factor(bearing)
+    return np.column_stack([np.maximum(read_m, 1e-3), bearing + value["bearing_bias_rad"]])
+
+
+def _correct_readings(
+    range_m: FloatArray, bearing_rad: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mount (3,), and points (M, 2) in the frame of the sensor that it would read so (M,), (M,)."""
+    value = _PlanarCalibration(parameters)
+    bearing = bearing_rad - value["bearing_bias_rad"]
+    read = (range_m - value["range_bias_m"]) / value.find_factor(bearing)
+    return value.find_mount(recording), _points(np.maximum(read, 1e-3), bearing)
+
+
+class _PlanarCalibration:
+    """Values of the estimated calibration of a sensor in the plane, by name; 0 of what was not estimated."""
+
+    def __init__(self, parameters: tuple[ParameterEstimate, ...]) -> None:
+        self._value = {each.name: each.value for each in parameters}
+
+    def __getitem__(self, name: str) -> float:
+        return self._value.get(name, 0.0)
+
+    def find_mount(self, recording: Recording) -> FloatArray:
+        """Return the mount (3,) of the sensor."""
+        mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
+        return mount + [self["mount_forward_m"], self["mount_left_m"], 0.0]
+
+    def find_factor(self, bearing_rad: FloatArray) -> FloatArray:
+        """Return by what ranges are multiplied in directions (...)."""
+        skew, curve = self["range_skew_per_rad"], self["range_curvature_per_rad2"]
+        return np.asarray(1.0 + self["range_slope"] + skew * bearing_rad + curve * bearing_rad**2)
 
 
 def _rows_of(places: Landmarks, landmark_id: IntArray) -> tuple[IntArray, BoolArray]:

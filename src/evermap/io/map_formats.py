@@ -231,6 +231,17 @@ def correct_map(file: SurveyFile, corrections: Iterable[Correction]) -> bytes:
     return edit_text(text, entries, ids, wanted, units).encode("utf-8")
 
 
+def write_corrected(file: SurveyFile, corrections: Iterable[Correction], path: str | Path) -> Path:
+    """Write a map's file with corrections; one without any as it is, to the last byte. Returns the path.
+
+    Errors are those of `correct_map`.
+    """
+    wanted = list(corrections)
+    if not wanted and _is_named_packed(file.path) == _is_named_packed(Path(path)):  # to pack again gives other bytes
+        return write_atomic(path, file.path.read_bytes())
+    return write_map_bytes(correct_map(file, wanted), path)
+
+
 def _ids_of(entries: Sequence[FileEntry], landmarks: Landmarks) -> list[int]:
     by_name = {name: identity for identity, name in landmarks.names.items()}
     return [by_name[one.label] if one.label in by_name else int(float(one.label)) for one in entries]
@@ -261,7 +272,11 @@ def write_map(landmarks: Landmarks, path: str | Path, kind: MapFormat) -> Path:
 
 def write_map_bytes(data: bytes, path: str | Path) -> Path:
     """Write the bytes of a map; gzipped where the name ends so. Returns the path."""
-    return write_atomic(path, gzip.compress(data, mtime=0) if Path(path).name.endswith(".gz") else data)
+    return write_atomic(path, gzip.compress(data, mtime=0) if _is_named_packed(Path(path)) else data)
+
+
+def _is_named_packed(path: Path) -> bool:
+    return path.name.endswith(".gz")
 
 
 def format_called(name: str | None, path: Path) -> MapFormat:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap.existence.hours import LEAST_ENDS
+from evermap.existence.hours import describe_hours
 from evermap.existence.rhythm import Rhythm
 from evermap.survival.base import LifetimePrior
 from evermap.survival.families import GeneralPurpose
@@ -99,6 +99,16 @@ class Lives:
             return age
         return np.where(self.follows(class_id), rhythm.count_s(until_s) - rhythm.count_s(since_s), age)
 
+    def describe_hours(self, clock: Clock, class_id: int | None = None) -> list[str]:
+        """Return a line on the hours of the week at which stays of a class end, or of all; none where nobody could
+        ask.
+        """
+        if not len(self.hours_known):
+            return []
+        n_dated, nats = self.hours_known.tolist()
+        follows = class_id is None or bool(self.follows(np.array([class_id]))[0])
+        return describe_hours(n_dated, nats, self.rhythm, clock, follows=follows)
+
     def of(self, class_id: int, position_m: FloatArray | None = None) -> Life:
         """Return the life of a class (or `UNKNOWN`), at a position (2,), in space (3,), or on the whole floor: learned,
         else given, else learned over all classes.
@@ -128,33 +138,6 @@ class Lives:
     def _learned(self, class_id: int, chunk: IntArray) -> Life | None:
         found = np.flatnonzero((self.class_id == class_id) & np.all(self.chunk == chunk, axis=1))
         return self.life[int(found[0])] if len(found) else None
-
-
-DAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
-
-
-def describe_hours(lives: Lives, clock: Clock, class_id: int | None = None) -> list[str]:
-    """Return a line on what is known of the hours of the week at which stays end, of a class or of all; none where
-    nobody could ask.
-    """
-    if not len(lives.hours_known):
-        return []
-    n_dated, nats = lives.hours_known.tolist()
-    open_text = f"at which hour of the day stays end is open: looks are worth {n_dated:.1f} ends of a known hour"
-    if not len(lives.log_factor):
-        none = f"stays end at all hours of the week alike (evidence for a rhythm {nats:.1f} nats)"
-        return [none if n_dated >= LEAST_ENDS else open_text]
-    if class_id is not None and not lives.follows(np.array([class_id]))[0]:
-        return ["stays of its class do not follow the hours of the week that others follow"]
-    factor = np.exp(lives.log_factor).reshape(len(DAYS) * 24, -1).mean(axis=1)
-    zone = " UTC" if clock is Clock.UNIX else ""
-    most, least = (
-        f"{DAYS[at // 24]} {at % 24:02d}:00{zone} ({factor[at]:.2g})"
-        for at in (int(factor.argmax()), int(factor.argmin()))
-    )
-    line = f"stays end by the hours of the week, most often on {most}, least often on {least} times the mean rate"
-    line += f" (evidence {nats:.1f} nats)"
-    return [line] if n_dated >= LEAST_ENDS else [line, open_text]
 
 
 EVERYWHERE = np.iinfo(np.int64).min

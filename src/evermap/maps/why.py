@@ -11,7 +11,6 @@ import numpy as np
 from evermap.errors import InputError, similar
 from evermap.existence.sites import Evidence
 from evermap.maps.diff import edits, renames, story_of
-from evermap.maps.lives import describe_hours
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.store.content import DamagedError
 from evermap.maps.store.measured import LOOKS, read_looks
@@ -291,7 +290,7 @@ def _on_learning(answer: Answer, living: LivingMap) -> list[str]:
     if said is not None:
         taught.append(f"what a user stated, which is worth {said.n_stays} stays")
     lines = [f"how long it stays is known from {'; '.join(taught)}"] if taught else []
-    return [*lines, *describe_hours(lives, living.clock, class_id)] if life.n_stays else lines
+    return [*lines, *lives.describe_hours(living.clock, class_id)] if life.n_stays else lines
 
 
 def _looks(seen: Evidence) -> str:

@@ -160,13 +160,11 @@ def hours_dict(living: LivingMap) -> dict[str, Any]:
     `factor` has the factor on hazards for each of the 168 hours from Monday 00:00 on, of the classes in `classes`; None
     where stays end at all hours alike, or looks do not show it.
     """
-    import numpy as np
-
     lives = living.lives
     if not len(lives.hours_known):
         return {}
     n_dated, nats = lives.hours_known.tolist()
-    factor = np.exp(lives.log_factor).reshape(168, -1).mean(axis=1).round(4).tolist() if lives.rhythm else None
+    factor = lives.rhythm.hourly_factor.round(4).tolist() if lives.rhythm else None
     classes = labels_of(lives.hourly_class_id, living.class_names)
     return {"hours": {"ends_dated": n_dated, "evidence_nats": json_number(nats), "factor": factor, "classes": classes}}
 

@@ -95,6 +95,7 @@ class Lasting(NamedTuple):
         if not self.any:
             return np.zeros(influence.shape[2])
         flat = np.ascontiguousarray(influence.reshape(len(place), -1))
+        place = np.ascontiguousarray(place)
         both = 2.0 * (flat * carry(flat, stamp_s, place, self.persist_s, self.share)).sum(axis=0)
         return np.asarray(both.reshape(influence.shape[1:]).sum(axis=0))
 

@@ -95,6 +95,13 @@ class CensoredLifetimes(ShownTable):
         """Return (N,) whether the end was observed."""
         return np.asarray(self.left_s == self.right_s)
 
+    @property
+    def at_risk_s(self) -> tuple[float, float]:
+        """Return the ages between which an end would have been seen: of others no estimate knows anything."""
+        counts = self.weight > 0.0
+        last_s = np.where(np.isinf(self.right_s), np.maximum(self.left_s, self.entry_s), self.right_s)
+        return float(self.entry_s[counts].min()), float(last_s[counts].max())
+
 
 def _refuse(bad: BoolArray, values: FloatArray, field: str, problem: str) -> None:
     if bad.any():

@@ -22,7 +22,7 @@ from evermap.survival.text import parse_prior
 from evermap.tracking.detections import read_detections
 from evermap.tracking.field_of_view import find_field_of_view
 from evermap.tracking.frame import DetectionTable, p_real_of
-from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
+from evermap.tracking.record import Event, Followed, Recorder, StaticSpells, Tracks
 from evermap.tracking.standing import Stood, join_stood, standing
 from evermap.tracking.state_file import State, read_state
 from evermap.tracking.tracker import Tracker
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 FEW = 5
 """So many things by chance are no pattern."""
+IS_THERE = 0.5
+"""What is followed with at least this probability hides what is behind it."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -178,12 +180,14 @@ def run_track(
             path=table.source or None,
             hint=hint,
         )
-    confirmed = np.isin(track_of_detection, tracks.track_id[tracks.state != TrackState.BIRTH])
-    track_of_detection = np.where(confirmed, track_of_detection, UNKNOWN)
+    real = tracks.track_id[tracks.state != TrackState.BIRTH]
+    track_of_detection = np.where(np.isin(track_of_detection, real), track_of_detection, UNKNOWN)
     spells = tracker.static_spells()
     if stood is None:  # a slow object passes the test for rest again and again, but does not rest
         spells = spells[spells.last_s - spells.first_s >= config.rest_for_s]
     lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
+    objects = tracks[np.isin(tracks.track_id, real)]
+    returns = _describe_returns(spells, objects, recorder.events, config.place_sigma_m)
     return TrackResult(
         table=table,
         config=config,
@@ -195,7 +199,7 @@ def run_track(
         spell_of_lifetime=spell_of_lifetime,
         n_gaps=n_gaps,
         seconds=perf_counter() - start,
-        warnings=(*_remarks(table, config, spells), *seen, *_describe_returns(spells, config.place_sigma_m)),
+        warnings=(*_remarks(table, config, spells), *seen, *returns),
         p_static=None if stood is None else np.array([stood.p_still.get(k, np.nan) for k in tracks.track_id.tolist()]),
         stood=stood,
     )
@@ -346,6 +350,7 @@ def _follow(
     sees = None if config.range_m is None else find_field_of_view(table, config)
     p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
     begin, parts, earlier = 0, list[Stood](), tracker.n_objects
+    followed: Followed | None = None
 
     def judge(end: int) -> None:
         if table.box is not None and end > begin:
@@ -365,6 +370,9 @@ def _follow(
         if config.range_m is not None and table.sensor_m is not None:
             around = centre_m, config.range_m, config.p_detect
             view = View.ball(*around) if sees is None else sees.view(k, *around)
+            if followed is not None and table.box is not None:
+                there = followed.p_exists >= IS_THERE  # also what is missed in this frame hides what is behind it
+                view = view.behind(followed.position_m[there], followed.box[there])
         found[rows], events = tracker.step(
             stamp_s,
             table.position_m[rows],
@@ -375,7 +383,8 @@ def _follow(
             appearance=None if table.appearance is None else table.appearance[rows],
             view=view,
         )
-        recorder.add(tracker.followed(), events)
+        followed = tracker.followed()
+        recorder.add(followed, events)
         if progress and k % 100 == 99:
             progress(k + 1, table.n_frames)
     judge(table.n_frames)
@@ -436,25 +445,52 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     unknown = int((~np.isfinite(spells.elsewhere_s)).sum())
     if unknown:
         what = f"{counted(unknown, 'spell')} whose beginning has no bound"
-        remarks.append(f"{what}, since the place was not observed before: in spells.csv, not in lifetimes.csv")
+        why = "since the place was not observed before"
+        if config.range_m is None:
+            why = "since without `range_m` no place is known to be observed"
+        remarks.append(f"{what}, {why}: in spells.csv, not in lifetimes.csv")
     return remarks
 
 
-def _describe_returns(spells: StaticSpells, within_m: float) -> list[str]:
-    """Say so where most stays that ended are followed by another object of that class in that place.
+def _describe_returns(spells: StaticSpells, objects: Tracks, events: Sequence[Event], within_m: float) -> list[str]:
+    """Say so where most of what stood and left is followed by another object of that class in that place.
 
-    Such an object has not left: it was missed because it was not looked at.
+    Such an object has not left: it was missed because it was not looked at. Also of those that were seen too briefly to
+    rest, `objects` by their rows.
     """
-    ended = np.flatnonzero(np.isfinite(spells.gone_s))
+    brief = _stand_briefly(objects, np.setdiff1d(_list_dead(events), spells.track_id), within_m)
+    later = _stand_briefly(objects, np.setdiff1d(objects.track_id, spells.track_id), within_m)
+    left = spells[np.isfinite(spells.gone_s)].joined(brief)
+    came = spells.joined(later)
     again = 0
-    for k in ended:
-        near = np.linalg.norm(spells.position_m - spells.position_m[k], axis=1) < within_m
-        new = (spells.track_id != spells.track_id[k]) & (spells.class_id == spells.class_id[k])
-        again += bool((near & new & (spells.first_s >= spells.last_s[k])).any())
-    if again < FEW or again <= 0.5 * len(ended):
+    for k in range(len(left)):
+        near = np.linalg.norm(came.position_m - left.position_m[k], axis=1) < within_m
+        new = (came.track_id != left.track_id[k]) & (came.class_id == left.class_id[k])
+        again += bool((near & new & (came.first_s >= left.last_s[k])).any())
+    if again < FEW or again <= 0.5 * len(left):
         return []
-    what = f"{again} of {counted(len(ended), 'object')} that left were followed by the like in the very place"
+    what = f"{again} of {counted(len(left), 'object')} that left were followed by the like in the very place"
     return [f"{what}: misses come together; state what the sensor sees (`range_m`, `fov_deg`, poses)"]
+
+
+def _list_dead(events: Sequence[Event]) -> IntArray:
+    return np.array([event.track_id for event in events if event.kind == EventKind.DIED], dtype=np.int64)
+
+
+def _stand_briefly(objects: Tracks, track_id: IntArray, within_m: float) -> StaticSpells:
+    """Return those of some objects that were in one place as long as they were followed, as if they had rested."""
+    mine = objects[np.isin(objects.track_id, track_id)]
+    name, first = np.unique(mine.track_id, return_index=True)
+    last = np.searchsorted(mine.track_id, name, side="right") - 1
+    middle = (first + last) // 2
+    parts = (first, middle), (middle, last), (first, last)
+    begin, end, place = (
+        np.array([np.median(mine.position_m[a : b + 1], axis=0) for a, b in zip(*part, strict=True)]).reshape(-1, 3)
+        for part in parts
+    )
+    stands = np.linalg.norm(end - begin, axis=1) < within_m
+    stamp_s, forever, kind = mine.stamp_s, np.full(len(name), np.inf), mine.class_p[last].argmax(axis=1)
+    return StaticSpells(name, kind, place, -forever, stamp_s[first], stamp_s[last], stamp_s[last])[stands]
 
 
 def warm_up() -> None:

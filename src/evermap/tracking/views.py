@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -14,6 +14,10 @@ from evermap.types import FloatArray
 
 if TYPE_CHECKING:
     from evermap.sensing.visibility import DetectionModel
+
+
+SHADE = "shade"
+"""End of the names of the columns of what views do not see."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +30,15 @@ class View:
         p_detect: for positions (N, 3) in the world, (N,) probabilities to detect an object there.
         sector_of: probability, heading, angle and angle beside it [rad] of a sector; of a ball an angle of 2 pi; None
             for any other view, which is not saved with a tracker.
+        shade: (M, 5) what is hidden: within an angle around a bearing in the world [rad, rad], farther than a
+            horizontal range [m], where the line of sight passes between two heights there [m, m].
     """
 
     centre_m: FloatArray
     reach_m: float
     p_detect: Callable[[FloatArray], FloatArray]
     sector_of: tuple[float, float, float, float] | None = None
+    shade: FloatArray = field(default_factory=lambda: np.zeros((0, 5)))
 
     @classmethod
     def of(cls, model: DetectionModel, pose_world_sensor: FloatArray, reach_m: float) -> Self:
@@ -71,6 +78,42 @@ class View:
             return np.where(np.linalg.norm(off, axis=1) <= reach_m, p_detect * share, 0.0)
 
         return cls(centre_m, reach_m, within, (p_detect, yaw_rad, fov_rad, beside_rad))
+
+    def behind(self, middle_m: FloatArray, box: FloatArray) -> Self:
+        """Return the view without what is behind boxes with middles (M, 3) and lengths, widths, heights, yaws (M, 4).
+
+        What is nearer than the far end of a box, or seen above it, is in view.
+        """
+        length, width, height, yaw = (column[:, None] for column in box.T)
+        along, across = 0.5 * length * [-1.0, -1.0, 1.0, 1.0], 0.5 * width * [-1.0, 1.0, -1.0, 1.0]
+        off = middle_m - self.centre_m
+        x = off[:, :1] + along * np.cos(yaw) - across * np.sin(yaw)
+        y = off[:, 1:2] + along * np.sin(yaw) + across * np.cos(yaw)
+        bearing = np.arctan2(off[:, 1], off[:, 0])
+        turn = np.remainder(np.arctan2(y, x) - bearing[:, None] + np.pi, 2.0 * np.pi) - np.pi
+        low, high = turn.min(axis=1), turn.max(axis=1)
+        far_m, z_m = np.hypot(x, y).max(axis=1), middle_m[:, 2]
+        half_m = 0.5 * height[:, 0]
+        columns = [bearing + 0.5 * (low + high), 0.5 * (high - low), far_m, z_m - half_m, z_m + half_m]
+        shade = np.column_stack(columns)
+        return self.shaded(shade[high - low < np.pi])  # who stands within a box sees what is around it
+
+    def shaded(self, shade: FloatArray) -> Self:
+        """Return the view without what is hidden, as `shade` says."""
+        if not len(shade):
+            return self
+        middle, half, far_m, low_m, high_m = shade.T
+
+        def within(position_m: FloatArray) -> FloatArray:
+            off = position_m - self.centre_m
+            range_m = np.hypot(off[:, 0], off[:, 1])[:, None]
+            bearing = np.arctan2(off[:, 1], off[:, 0])[:, None]
+            aside = np.abs(np.remainder(bearing - middle + np.pi, 2.0 * np.pi) - np.pi)
+            passes_m = self.centre_m[2] + off[:, 2:] * far_m / np.maximum(range_m, 1e-9)
+            hidden = (range_m > far_m) & (aside < half) & (low_m < passes_m) & (passes_m < high_m)
+            return np.where(hidden.any(axis=1), 0.0, self.p_detect(position_m))
+
+        return replace(self, p_detect=within, shade=np.vstack([self.shade, shade]))
 
     def probability(self, position_m: FloatArray) -> FloatArray:
         """Return (N,) `p_detect`, or raise an InputError unless that is one probability a position."""
@@ -148,25 +191,24 @@ class ViewMemory:
     def columns(self) -> dict[str, FloatArray]:
         """Return what `restore` takes: balls and sectors; without other views, a place is seen empty later."""
         kept = [entry for entries in self._kept.values() for entry in entries]
-        rows = {
-            name: [
-                [stamp, *view.centre_m.tolist(), view.reach_m, *view.sector_of]
-                for stamp, view in views
-                if view.sector_of is not None
-            ]
-            for name, views in (("recent", self._recent), ("kept", kept), ("last", [self._last] if self._last else []))
-        }
+        rows, shades = dict[str, list[list[float]]](), dict[str, FloatArray]()
+        for name, views in (("recent", self._recent), ("kept", kept), ("last", [self._last] if self._last else [])):
+            saved = [(stamp, view, view.sector_of) for stamp, view in views if view.sector_of is not None]
+            rows[name] = [[stamp, *view.centre_m.tolist(), view.reach_m, *sector] for stamp, view, sector in saved]
+            of = [np.column_stack([np.full(len(view.shade), k), view.shade]) for k, (_, view, _) in enumerate(saved)]
+            shades[f"{name}_{SHADE}"] = np.vstack([np.zeros((0, 6)), *of])
         numbers = np.array([self._n_in_burst, self._chunk_m, self._reach_m], dtype=np.float64)
-        return {name: np.array(of, dtype=np.float64).reshape(-1, 9) for name, of in rows.items()} | {"numbers": numbers}
+        columns = {name: np.array(of, dtype=np.float64).reshape(-1, 9) for name, of in rows.items()}
+        return columns | shades | {"numbers": numbers}
 
     def restore(self, columns: Mapping[str, FloatArray]) -> None:
         """Take over the views that `columns` gave."""
         n_in_burst, self._chunk_m, self._reach_m = columns["numbers"].tolist()
         self._n_in_burst = int(n_in_burst)
-        self._recent.extend(map(_view_of, columns["recent"]))
-        for stamp, view in map(_view_of, columns["kept"]):
+        self._recent.extend(_views_of(columns, "recent"))
+        for stamp, view in _views_of(columns, "kept"):
             self._kept.setdefault(self._chunk_of(view.centre_m), []).append((stamp, view))
-        self._last = next(map(_view_of, columns["last"]), None)
+        self._last = next(iter(_views_of(columns, "last")), None)
 
     def _backwards(self, position_m: FloatArray) -> list[tuple[float, View]]:
         """Views that may show a place, the last first."""
@@ -185,10 +227,12 @@ class ViewMemory:
         return int(np.floor(position_m[0] / chunk)), int(np.floor(position_m[1] / chunk))
 
 
-def _view_of(row: FloatArray) -> tuple[float, View]:
-    """Stamp and view of a row of `ViewMemory.columns`."""
-    stamp_s, x, y, z, reach_m, p_detect, *angles = row.tolist()
-    centre_m = np.array([x, y, z])
-    if angles[1] == 2.0 * np.pi:
-        return stamp_s, View.ball(centre_m, reach_m, p_detect)
-    return stamp_s, View.sector(centre_m, reach_m, p_detect, *angles)
+def _views_of(columns: Mapping[str, FloatArray], name: str) -> list[tuple[float, View]]:
+    """Stamps and views of the rows of `ViewMemory.columns` of a name; older states have no shades."""
+    shade = columns.get(f"{name}_{SHADE}", np.zeros((0, 6)))
+    found = []
+    for k, (stamp_s, x, y, z, reach_m, p_detect, *angles) in enumerate(columns[name].tolist()):
+        around = np.array([x, y, z]), reach_m, p_detect
+        view = View.ball(*around) if angles[1] == 2.0 * np.pi else View.sector(*around, *angles)
+        found.append((stamp_s, view.shaded(shade[shade[:, 0] == k, 1:])))
+    return found

@@ -30,7 +30,9 @@ def laid(one: World, search: str = "joint") -> Overlay:
     return found
 
 
-@pytest.mark.parametrize("seed", [*range(20), 46, 66, 127, 147])
+@pytest.mark.parametrize(
+    "seed", [*range(6), 46, 66, 127, 147, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 20))]
+)
 def test_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
     random = np.random.default_rng(seed)
     cliques = int(random.integers(4, 7))
@@ -51,7 +53,7 @@ def test_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
     assert found.drift_m == best_drift_m
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 12))])
 def test_in_space_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
     """Where it lies about is known there, and orientations say something of each site."""
     random = np.random.default_rng(300 + seed)
@@ -346,7 +348,9 @@ def test_bodies_that_moved_together_by_less_than_agreement_do_not_bend_what_stan
     np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), one.site)
 
 
-@pytest.mark.parametrize("seed", [403, 405, 410, 411, 414, 416])
+@pytest.mark.parametrize(
+    "seed", [403, 405, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (410, 411, 414, 416))]
+)
 def test_landmarks_that_are_turned_in_their_places_were_moved(seed: int) -> None:
     """Their positions are as of what stands; the most probable of all assignments tells so by their orientations."""
     random = np.random.default_rng(seed)

@@ -289,7 +289,7 @@ def test_a_session_elsewhere_leaves_the_map_as_it_was(still: tuple[BuildingSimul
     assert session.slam.landmarks.frame == "first_pose"
 
 
-@pytest.mark.parametrize("late_s", [7.0, 15.0, 30.0])
+@pytest.mark.parametrize("late_s", [15.0, *(pytest.param(late_s, marks=pytest.mark.slow) for late_s in (7.0, 30.0))])
 def test_a_session_whose_odometry_is_of_another_drive_is_not_believed(
     late_s: float, still: tuple[BuildingSimulation, list[Session]]
 ) -> None:
@@ -360,7 +360,7 @@ def test_a_session_is_as_old_as_its_recording_whatever_is_left_out(
         assert after.living.session_start_s == expected_s
 
 
-@pytest.mark.parametrize("seed", [5, 6, 7, 8])
+@pytest.mark.parametrize("seed", [5, 6, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (7, 8))])
 def test_another_building_with_the_same_identities_is_not_this_one(
     seed: int, still: tuple[BuildingSimulation, list[Session]]
 ) -> None:

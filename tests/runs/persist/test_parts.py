@@ -78,7 +78,7 @@ def same(path: Path, folder: Path, *more: str, rows: int = 300, figures: int = 0
     return parts
 
 
-@pytest.mark.parametrize("query", ["times", "grid"])
+@pytest.mark.parametrize("query", [pytest.param("times", marks=pytest.mark.slow), "grid"])
 def test_in_parts_the_files_are_those_of_one_piece(tmp_path: Path, query: str) -> None:
     told = same(write(looks(), tmp_path / "looks.parquet"), tmp_path, "--set", f"query={query}", figures=2)
     assert told["counts"]["rows"] == 4000
@@ -96,7 +96,7 @@ def test_a_folder_of_files_is_one_table(tmp_path: Path) -> None:
         assert (tmp_path / "single" / name).read_bytes() == (tmp_path / "many" / "parts" / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("per", ["all", "auto"])
+@pytest.mark.parametrize("per", [pytest.param("all", marks=pytest.mark.slow), "auto"])
 def test_models_are_learned_from_the_same_looks(tmp_path: Path, per: str) -> None:
     path = write(looks(2, classes=per == "auto"), tmp_path / "looks.parquet")
     more = ("--set", "recurrent=two-state", "--set", f"per={per}", "--set", "learn_from=900")

@@ -266,7 +266,7 @@ def check_orchard(kind: Orchard, seed: int, most_m: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("false", 2), pytest.param("false", 11, marks=pytest.mark.slow), ("narrow", 18)]
+    ("kind", "seed"), [*(pytest.param("false", seed, marks=pytest.mark.slow) for seed in (2, 11)), ("narrow", 18)]
 )
 def test_trees_are_kept_where_the_first_pass_goes_wrong(kind: str, seed: int) -> None:
     """It took a row for the next one, or closed no loop: what odometry alone leads to explains more."""

@@ -78,7 +78,7 @@ def test_visits_are_landmarks_of_their_own_but_for_names() -> None:
     assert visits.tolist() == [0, 0, NOBODY, 1, 1, 1, 1, 2, 3]
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5])
+@pytest.mark.parametrize("share", [0.2, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_half_of_a_building_has_names(share: float) -> None:
     recording = building(2).sessions[0]
     true, some = recording.detections.landmark_id, with_some_named(recording, share)
@@ -89,6 +89,7 @@ def test_half_of_a_building_has_names(share: float) -> None:
     check_names(found, some.detections.landmark_id, true)
 
 
+@pytest.mark.slow
 def test_tags_that_are_not_always_read() -> None:
     """Of half of the detections of each landmark the id is missing: they are of the same landmarks."""
     recording = building(2).sessions[0]

@@ -40,7 +40,7 @@ def scored(recording: SpatialRecording, *, purity: float, completeness: float) -
     return found
 
 
-@pytest.mark.parametrize("drift", [0.01, 0.1])
+@pytest.mark.parametrize("drift", [pytest.param(0.01, marks=pytest.mark.slow), 0.1])
 def test_points_of_a_hall_are_told_apart_and_met_again(drift):
     recording = hall(1, n_points=40, n_frames=400, drift=drift)
     found = scored(recording, purity=0.995, completeness=0.99)
@@ -144,7 +144,8 @@ def test_two_at_one_place_are_told_apart_by_a_column():
     np.testing.assert_array_equal(found(features=useless, feature_names=("colour",)), alone)
 
 
-@pytest.mark.parametrize("share", [0.2, pytest.param(0.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.2, 0.5])
 def test_points_of_which_some_have_names(share):
     recording = hall(1, n_points=40, n_frames=400, drift=0.1)
     true = recording.detections.landmark_id

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -129,73 +130,73 @@ def counted(made: Week, told: list[tuple[MapChange, ...]], slots: dict[int, int]
     return Count(right, total, true)
 
 
-@pytest.fixture(scope="module")
-def days() -> dict[tuple[int, bool], tuple[Week, list[Session]]]:
-    """Three days of two streets."""
-    found = {}
-    for seed, back in ((1, False), (2, False), (3, True)):
-        made, living, sessions = week(seed), None, []
-        for recording in recordings(made, seed, back=back):
-            sessions.append(run_session(recording, living))
-            living = sessions[-1].living
-        found[seed, back] = made, sessions
-    return found
+Days = tuple[Week, list[Session]]
 
 
-Days = dict[tuple[int, bool], tuple[Week, list[Session]]]
+@functools.cache
+def drive_days(seed: int, back: bool) -> Days:
+    """Three days of a street."""
+    made, living, sessions = week(seed), None, list[Session]()
+    for recording in recordings(made, seed, back=back):
+        sessions.append(run_session(recording, living))
+        living = sessions[-1].living
+    return made, sessions
 
 
-def test_what_stands_is_known_once_and_what_changed_is_told(days: Days) -> None:
-    counts = []
-    for (_, back), (made, sessions) in days.items():
-        street = made.street
-        assert all(session.found for session in sessions)
-        slots = dict(zip(*(column.tolist() for column in in_street(sessions[-1].living, street)), strict=True))
-        for day, session in enumerate(sessions):
-            names, at = in_street(session.living, street)
-            exists = session.living.landmarks().p_exists >= 0.5
-            here, sure = at[exists], street.find_passed(PARTS[day]) - hidden(street, PARTS[day])
-            assert len(np.unique(here)) == len(here), day  # no duplicates
-            standing = street.standing(day * DAY_S + 40.0)
-            stands = {slot for slot in here.tolist() if slot in sure}
-            if back and day == 2:  # nobody knew that these places can be seen from there
-                assert stands >= standing & sure
-            else:
-                assert stands == standing & sure
-            slots |= dict(zip(names.tolist(), at.tolist(), strict=True))
-        if not back:
-            counts.append(counted(made, [session.changes for session in sessions], slots))
-        assert -1 not in slots.values()  # wrong boxes are no landmarks
-    right, told, true = np.sum(counts, axis=0)
-    assert true >= 30, (right, told, true)
-    assert right >= 0.9 * true
-    assert right >= 0.9 * told
+@pytest.fixture
+def days() -> Days:
+    return drive_days(1, False)
 
 
-def test_boxes_are_as_they_are_where_ids_are_ignored(days: Days) -> None:
+STREETS = [(1, False), pytest.param(2, False, marks=pytest.mark.slow), (3, True)]
+
+
+@pytest.mark.parametrize(("seed", "back"), STREETS)
+def test_what_stands_is_known_once_and_what_changed_is_told(seed: int, back: bool) -> None:
+    made, sessions = drive_days(seed, back)
+    street = made.street
+    assert all(session.found for session in sessions)
+    slots = dict(zip(*(column.tolist() for column in in_street(sessions[-1].living, street)), strict=True))
+    for day, session in enumerate(sessions):
+        names, at = in_street(session.living, street)
+        exists = session.living.landmarks().p_exists >= 0.5
+        here, sure = at[exists], street.find_passed(PARTS[day]) - hidden(street, PARTS[day])
+        assert len(np.unique(here)) == len(here), day  # no duplicates
+        standing = street.standing(day * DAY_S + 40.0)
+        stands = {slot for slot in here.tolist() if slot in sure}
+        if back and day == 2:  # nobody knew that these places can be seen from there
+            assert stands >= standing & sure
+        else:
+            assert stands == standing & sure
+        slots |= dict(zip(names.tolist(), at.tolist(), strict=True))
+    assert -1 not in slots.values()  # wrong boxes are no landmarks
+    if not back:
+        right, told, true = counted(made, [session.changes for session in sessions], slots)
+        assert true >= 15, (right, told, true)
+        assert right >= 0.9 * true
+        assert right >= 0.9 * told
+
+
+@pytest.mark.parametrize("given", [True, pytest.param("empty", marks=pytest.mark.slow)])
+def test_boxes_are_as_they_are_where_ids_are_ignored(days: Days, given: bool | str) -> None:
     """They have none anyway; nothing else is there to be associated."""
-    made, sessions = days[1, False]
-    first = recordings(made, 1)[0]
-    for given in (True, "empty"):
-        session = run_session(first, None, Config(slam={"unknown_ids": given}))
-        np.testing.assert_array_equal(session.living.places.position_m, sessions[0].living.places.position_m)
-        assert session.living.landmark_texts == sessions[0].living.landmark_texts
+    made, sessions = days
+    session = run_session(recordings(made, 1)[0], None, Config(slam={"unknown_ids": given}))
+    np.testing.assert_array_equal(session.living.places.position_m, sessions[0].living.places.position_m)
+    assert session.living.landmark_texts == sessions[0].living.landmark_texts
 
 
-def test_what_comes_and_leaves_in_view_is_told_with_its_instant(days: Days) -> None:
-    for (_, back), (made, sessions) in days.items():
-        if back:
-            continue
-        slots = dict(zip(*(column.tolist() for column in in_street(sessions[-1].living, made.street)), strict=True))
-        seen = 0
-        for day, at_s, slot, comes in made.in_view:
-            kinds = COMES if comes else (ChangeKind.VANISHED,)
-            mine = [
-                one for one in sessions[day].changes if slots.get(one.landmark_ids[0]) == slot and one.kind in kinds
-            ]
-            when = day * DAY_S + at_s
-            seen += len(mine) == 1 and when - 2.0 < mine[0].stamp_from_s <= mine[0].stamp_to_s < when + 2.5
-        assert seen >= 3  # of four; one may be behind another car then
+@pytest.mark.parametrize(("seed", "back"), STREETS[:2])
+def test_what_comes_and_leaves_in_view_is_told_with_its_instant(seed: int, back: bool) -> None:
+    made, sessions = drive_days(seed, back)
+    slots = dict(zip(*(column.tolist() for column in in_street(sessions[-1].living, made.street)), strict=True))
+    seen = 0
+    for day, at_s, slot, comes in made.in_view:
+        kinds = COMES if comes else (ChangeKind.VANISHED,)
+        mine = [one for one in sessions[day].changes if slots.get(one.landmark_ids[0]) == slot and one.kind in kinds]
+        when = day * DAY_S + at_s
+        seen += len(mine) == 1 and when - 2.0 < mine[0].stamp_from_s <= mine[0].stamp_to_s < when + 2.5
+    assert seen >= 3  # of four; one may be behind another car then
 
 
 def test_a_van_where_a_car_had_stood_came_after_it() -> None:
@@ -216,37 +217,38 @@ def test_a_van_where_a_car_had_stood_came_after_it() -> None:
     assert 0.0 < told.stamp_from_s < 40.0  # when the car was seen last
 
 
-def test_stays_are_the_spells_and_what_lifetimes_are_learned_from(days: Days) -> None:
-    for made, sessions in days.values():
-        living = sessions[-1].living
-        street, stays = made.street, living.stays
-        clique = dict(zip(living.members.landmark_id.tolist(), living.members.clique_id.tolist(), strict=True))
-        slots = {clique[name]: at for name, at in zip(*(c.tolist() for c in in_street(living, street)), strict=True)}
-        found: dict[Spell, int] = {}
-        for row in range(len(stays)):
-            slot = slots[int(stays.clique_id[row])]
-            if slot not in street.find_passed(PARTS[1]) - hidden(street, PARTS[1]):
-                continue  # one may have left and another come, unseen
-            inside = [
-                one
-                for one in street.spells
-                if one.slot == slot and one.from_s < stays.first_s[row] + 1.0 and one.until_s > stays.last_s[row] - 1.0
-            ]
-            assert len(inside) == 1, (slot, stays.first_s[row], stays.last_s[row])
-            spell = inside[0]
-            assert stays.elsewhere_s[row] - 1.0 < spell.from_s
-            if np.isfinite(stays.gone_s[row]):
-                assert stays.gone_s[row] + 1.0 > spell.until_s
-            found[spell] = found.get(spell, 0) + 1
-        assert set(found.values()) == {1}  # each counts once
-        kind = living.class_names.index("Car")
-        life = living.lives.of(kind)
-        assert life.n_stays == len(stays)
-        assert life.n_ended == np.isfinite(stays.gone_s).sum()
+@pytest.mark.parametrize(("seed", "back"), STREETS)
+def test_stays_are_the_spells_and_what_lifetimes_are_learned_from(seed: int, back: bool) -> None:
+    made, sessions = drive_days(seed, back)
+    living = sessions[-1].living
+    street, stays = made.street, living.stays
+    clique = dict(zip(living.members.landmark_id.tolist(), living.members.clique_id.tolist(), strict=True))
+    slots = {clique[name]: at for name, at in zip(*(c.tolist() for c in in_street(living, street)), strict=True)}
+    found: dict[Spell, int] = {}
+    for row in range(len(stays)):
+        slot = slots[int(stays.clique_id[row])]
+        if slot not in street.find_passed(PARTS[1]) - hidden(street, PARTS[1]):
+            continue  # one may have left and another come, unseen
+        inside = [
+            one
+            for one in street.spells
+            if one.slot == slot and one.from_s < stays.first_s[row] + 1.0 and one.until_s > stays.last_s[row] - 1.0
+        ]
+        assert len(inside) == 1, (slot, stays.first_s[row], stays.last_s[row])
+        spell = inside[0]
+        assert stays.elsewhere_s[row] - 1.0 < spell.from_s
+        if np.isfinite(stays.gone_s[row]):
+            assert stays.gone_s[row] + 1.0 > spell.until_s
+        found[spell] = found.get(spell, 0) + 1
+    assert set(found.values()) == {1}  # each counts once
+    kind = living.class_names.index("Car")
+    life = living.lives.of(kind)
+    assert life.n_stays == len(stays)
+    assert life.n_ended == np.isfinite(stays.gone_s).sum()
 
 
 def test_sizes_and_names_are_kept(days: Days, tmp_path: Path) -> None:
-    made, sessions = days[1, False]
+    made, sessions = days
     first, third = sessions[0].living, sessions[2].living
     kept = np.isin(first.members.landmark_id, third.members.landmark_id)
     assert kept.mean() > 0.9  # the same ids
@@ -263,16 +265,15 @@ def test_sizes_and_names_are_kept(days: Days, tmp_path: Path) -> None:
     assert all(text.startswith("Car-") for text in third.landmark_texts)
 
 
-def test_a_drive_elsewhere_is_not_placed(days: Days) -> None:
-    _, sessions = days[1, False]
+@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
+def test_a_drive_elsewhere_is_not_placed(days: Days, seed: int) -> None:
+    _, sessions = days
     before = sessions[0].living
-    for seed in (21, 22):
-        other = week(seed)
-        session = run_session(other.street.drive(5, DAY_S, (0.1, 0.9)), before)
-        assert not session.found
-        assert session.living is not before or session.living == before
-        assert len(session.living.members) == len(before.members)
-        assert any("set aside" in warning for warning in session.slam.warnings)
+    session = run_session(week(seed).street.drive(5, DAY_S, (0.1, 0.9)), before)
+    assert not session.found
+    assert session.living is not before or session.living == before
+    assert len(session.living.members) == len(before.members)
+    assert any("set aside" in warning for warning in session.slam.warnings)
 
 
 def test_rows_that_look_alike_are_not_taken_for_each_other() -> None:
@@ -311,7 +312,7 @@ def test_the_frame_of_an_odometry_may_be_that_of_the_map() -> None:
 
 @pytest.mark.slow
 def test_deleted_boxes_stay_away_and_large_maps_are_the_same(days: Days) -> None:
-    made, sessions = days[1, False]
+    made, sessions = days
     first = sessions[0].living
     name = int(first.members.landmark_id[3])
     at = first.landmarks().position_m[first.landmarks().landmark_id == name][0]
@@ -329,7 +330,7 @@ def test_deleted_boxes_stay_away_and_large_maps_are_the_same(days: Days) -> None
 
 @pytest.mark.slow
 def test_a_store_takes_each_session_once_and_late_ones_in_order(days: Days, tmp_path: Path) -> None:
-    made, sessions = days[1, False]
+    made, sessions = days
     drives = recordings(made, 1)
     path = tmp_path / "street.evermap"
     with open_store(path, create=True) as store:
@@ -361,14 +362,12 @@ def test_a_store_takes_each_session_once_and_late_ones_in_order(days: Days, tmp_
         assert found.exit_code == 0, (words, found.output)
 
 
-def test_a_map_may_have_named_landmarks_beside_boxes(days: Days) -> None:
+def test_a_map_may_have_named_landmarks_beside_boxes() -> None:
     """Two cars that are known by name place a drive on which all others have changed."""
-    made, _ = days[1, False]
     rng, street = np.random.default_rng(3), Parking.of(11)
     for slot in (1, 5, 11, 24, 30):
         street.park(rng, slot, -1e6, 1e6)
     street.park(rng, 3, -1e6, 0.5 * DAY_S)
-    del made
 
     def named(recording: SpatialRecording) -> SpatialRecording:
         given, pose = recording.detections, recording.odometry

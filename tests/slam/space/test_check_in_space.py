@@ -230,8 +230,8 @@ def test_turned_by_the_mount() -> None:
 @pytest.mark.parametrize(
     "mistake",
     [
-        "x ahead",
-        pytest.param("positions in mm", marks=pytest.mark.slow),
+        pytest.param("x ahead", marks=pytest.mark.slow),
+        "positions in mm",
         pytest.param("odometry in mm", marks=pytest.mark.slow),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,7 +14,7 @@ from evermap.geometry import se3
 from evermap.io.spatial import spatial_detections
 from evermap.pipeline import run_slam
 from evermap.slam.space.problem import OdometryPath
-from evermap.types import Frames, SpatialOdometry, SpatialRecording, SpatialSensor, VerdictKind
+from evermap.types import Frames, SlamResult, SpatialOdometry, SpatialRecording, SpatialSensor, VerdictKind
 
 STEP = 1e-6
 
@@ -84,13 +86,19 @@ def stopping(late_s: float, seed: int, frame_s: float = 0.2, lag_s: float = 0.0)
     return SpatialRecording("stops", odometry, Frames(0.02 * at + late_s), detections, (SpatialSensor(),))
 
 
+@functools.cache
+def solve(late_s: float, frame_s: float) -> tuple[SpatialRecording, SlamResult]:
+    recording = stopping(late_s, 1, frame_s)
+    return recording, run_slam(recording, Config.model_validate({"slam": {"plane": False}}))
+
+
 def test_stops_hide_no_delay_in_space():
     """One jitter for the whole drive is enough: it is a median, and steps are as well known where the robot stands.
 
     By the rows around each, as in the plane, where standing steps are known better, speeding up counts as jitter, and
     what is taken off makes the delay too long (.233 s).
     """
-    result = run_slam(stopping(0.2, 1), Config.model_validate({"slam": {"plane": False}}))
+    _, result = solve(0.2, 0.2)
     delay = next(one for one in result.parameters if one.name == "sensor_delay_s")
     assert delay.p_needed > 0.99
     assert delay.value == pytest.approx(0.2, abs=0.025)
@@ -109,14 +117,17 @@ def test_a_delay_shorter_than_a_step_of_slow_odometry_is_found_in_space(late_s, 
 
     As of odometry that was made of the frames, no delay was asked; and by a velocity over a second it was .03 s off.
     """
-    result = run_slam(stopping(late_s, 1, frame_s), Config.model_validate({"slam": {"plane": False}}))
+    _, result = solve(late_s, frame_s)
     delay = next(one for one in result.parameters if one.name == "sensor_delay_s")
     assert delay.value == pytest.approx(late_s, abs=0.015)
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SOUND
 
 
-@pytest.mark.parametrize(("lag_s", "found_s"), [(-0.2, 0.2), (0.0, None), (0.2, None), (0.3, -0.3)])
+@pytest.mark.parametrize(
+    ("lag_s", "found_s"),
+    [(-0.2, 0.2), (0.2, None), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((0.0, None), (0.3, -0.3)))],
+)
 def test_odometry_with_the_stamps_of_all_frames_may_be_late_by_half_a_step(lag_s, found_s):
     """As visual odometry is, whose velocity is that of the step before. Nothing of it makes detections late: a robot
     logs both in one loop.
@@ -130,7 +141,5 @@ def test_odometry_with_the_stamps_of_all_frames_may_be_late_by_half_a_step(lag_s
 
 def test_late_detections_are_compared_with_poses_of_when_they_were_taken():
     """At their stamps the robot is .2 m farther: halves of a right solution differed by 13 % of the range."""
-    config = Config.model_validate({"slam": {"plane": False}})
-    late, punctual = (stopping(late_s, 1, 0.1) for late_s in (0.24, 0.0))
-    off, usual = (np.median(compare_detections(each, run_slam(each, config)).misfit) for each in (late, punctual))
+    off, usual = (np.median(compare_detections(*solve(late_s, 0.1)).misfit) for late_s in (0.2, 0.0))
     assert off == pytest.approx(usual, rel=0.05)

@@ -60,7 +60,7 @@ def fixes(random: np.random.Generator, p_wrong: float = 0.0) -> dict[str, np.nda
     return {"stamp_s": stamp_s, "x_m": at[:, 0], "y_m": at[:, 1], "z_m": at[:, 2], **full, **sigma}
 
 
-@pytest.mark.parametrize("p_wrong", [0.0, 0.1])
+@pytest.mark.parametrize("p_wrong", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_fixes_put_the_drive_where_it_was(p_wrong):
     result = run_slam(measured("gnss", **fixes(np.random.default_rng(0), p_wrong)))
     assert result.trajectory.frame == result.landmarks.frame == "gnss"
@@ -114,7 +114,9 @@ def test_tilt_and_height_are_held(kind):
         assert np.sqrt(np.mean(height**2)) < 0.025
 
 
-@pytest.mark.parametrize(("kind", "begin_s"), [("ranges", 0.3), ("bearings", 0.3), ("bearings", None)])
+@pytest.mark.parametrize(
+    ("kind", "begin_s"), [("ranges", 0.3), pytest.param("bearings", 0.3, marks=pytest.mark.slow), ("bearings", None)]
+)
 def test_landmarks_that_are_only_measured_are_mapped_and_hold_the_drive(kind, begin_s):
     """Also from the first pose on, at the origin, where a place that nobody located would be in no direction."""
     begin_s = float(drive().frames.stamp_s[0]) if begin_s is None else begin_s

@@ -39,7 +39,7 @@ def gap_m(result: SlamResult, world: World) -> np.ndarray:
 @pytest.mark.parametrize("turn", [pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.slow), (0.0, 0.1, 0.4)])
 @pytest.mark.parametrize(
     ("seed", "odometry", "points"),
-    [(0, True, False), pytest.param(3, True, False, marks=pytest.mark.slow), (5, True, True)],
+    [*(pytest.param(seed, True, False, marks=pytest.mark.slow) for seed in (0, 3)), (5, True, True)],
 )
 def test_a_shelf_with_four_tags_moved_as_one(seed, odometry, points, turn):
     world, shift = tagged_corridor(seed, odometry=odometry, drift=0.04), np.array([0.4, 0.0, 0.2])
@@ -92,6 +92,7 @@ def test_single_tags_that_moved_are_no_group():
     assert told[9,].rotation_rad == pytest.approx(0.5, abs=0.03)
 
 
+@pytest.mark.slow
 def test_two_tags_that_were_exchanged_are_each_where_the_other_was():
     world, order = tagged_corridor(3, drift=0.04), np.arange(12)
     order[[2, 9]] = 9, 2
@@ -104,12 +105,10 @@ def test_two_tags_that_were_exchanged_are_each_where_the_other_was():
     np.testing.assert_allclose(told[2,], -told[9,], atol=0.05)
 
 
-def test_nothing_is_told_where_nothing_moved():
-    for seed in range(300, 310):
-        random = np.random.default_rng(seed)
-        world = tagged_corridor(
-            seed, drift=0.04 if seed % 3 else 0.01, p_wrong=0.03 * (seed % 2), odometry=seed % 4 > 0
-        )
-        surveyed = world.tags.as_prior(0.02)
-        surveyed = replace(surveyed, position_m=surveyed.position_m + random.normal(0.0, 0.02, (12, 3)))
-        assert not run_slam(world.recording, prior_map=surveyed).changes
+@pytest.mark.parametrize("seed", [300, 301, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(302, 310))])
+def test_nothing_is_told_where_nothing_moved(seed):
+    random = np.random.default_rng(seed)
+    world = tagged_corridor(seed, drift=0.04 if seed % 3 else 0.01, p_wrong=0.03 * (seed % 2), odometry=seed % 4 > 0)
+    surveyed = world.tags.as_prior(0.02)
+    surveyed = replace(surveyed, position_m=surveyed.position_m + random.normal(0.0, 0.02, (12, 3)))
+    assert not run_slam(world.recording, prior_map=surveyed).changes

@@ -122,7 +122,7 @@ def test_what_moved_before_the_drive_and_what_moved_within_it_are_told_apart():
 
 
 @pytest.mark.parametrize("seed", [6, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (7, 8))])
-@pytest.mark.parametrize("corners", [True, False])
+@pytest.mark.parametrize("corners", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_two_tags_with_one_identity_that_are_seen_in_turns_did_not_move(seed, corners):
     world = tagged_corridor(seed, rename={10: 1})
     result = run_slam(world.recording if corners else as_poses(world, seed))
@@ -132,7 +132,7 @@ def test_two_tags_with_one_identity_that_are_seen_in_turns_did_not_move(seed, co
 
 
 @pytest.mark.parametrize("seed", [6, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (7, 8))])
-@pytest.mark.parametrize("corners", [True, False])
+@pytest.mark.parametrize("corners", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_two_tags_with_one_identity_are_two_where_no_look_shows_that_one_left(seed, corners):
     """One way, each is passed once: the first one may still be there, for all that was seen."""
     world = tagged_corridor(seed, rename={10: 1}, there_and_back=False)

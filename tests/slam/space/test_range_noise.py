@@ -123,7 +123,9 @@ def test_exact_positions_are_solved(outliers: float) -> None:
     assert result.verdict.kind.is_trustworthy
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "law", ["lidar", "sizes", *(pytest.param(law, marks=pytest.mark.slow) for law in ("constant", "stereo"))]
+)
 def test_noise_is_that_of_the_range(law: str) -> None:
     """One level has a lidar's noise wrong by a factor of five between the nearest and the farthest points."""
     optimum = solve(field(1, LAWS[law]))
@@ -136,6 +138,7 @@ def test_noise_is_that_of_the_range(law: str) -> None:
         assert np.median(found[some], axis=0) == pytest.approx(true, rel=0.12)
 
 
+@pytest.mark.slow
 def test_each_sensor_has_its_own() -> None:
     optimum = solve(field(2, LAWS["constant"], LAWS["stereo"]))
     range_m, found = sigmas_of(optimum)
@@ -213,8 +216,10 @@ def test_lengths_are_not_too_short_by_noise_that_grows() -> None:
     ("law", "in_map"),
     [
         ("constant", False),
-        ("stereo", True),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("constant", True), ("stereo", False))),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in (("constant", True), ("stereo", False), ("stereo", True))
+        ),
     ],
 )
 def test_a_sensor_without_a_data_sheet_is_no_suspect(law: str, in_map: bool) -> None:

@@ -25,7 +25,14 @@ def scored(recording: SpatialRecording, result: SlamResult) -> Evaluation:
     return found
 
 
-@pytest.mark.parametrize(("seed", "how"), [(0, "odometry"), (1, "by hand"), (2, "map"), (3, "map by hand")])
+@pytest.mark.parametrize(
+    ("seed", "how"),
+    [
+        (0, "odometry"),
+        (3, "map by hand"),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, "by hand"), (2, "map"))),
+    ],
+)
 def test_it_is_as_if_an_oracle_had_undone_the_turns(seed: int, how: str) -> None:
     room = Room.of(seed)
     known = room.map().as_prior(0.01) if "map" in how else None

@@ -640,7 +640,8 @@ def columns_of_inverse(
                 for a in range(tree.dim[v]):
                     row = reached[node] + tree.at[k] + a
                     right[tree.begin[v] + a] = ways[column, row] if reached[node] >= 0 else 0.0
-        back_substitute(tree, stored, right, border[:, column].copy(), x, 0, len(tree.parent))
+        first: Any = np.int64(0)  # no literal, for which numba would compile it again
+        back_substitute(tree, stored, right, border[:, column].copy(), x, first, len(tree.parent))
         out[:, column] = x
     return out
 

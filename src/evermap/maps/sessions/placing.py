@@ -7,6 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import sparse
+from scipy.special import logsumexp
 
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import FitConfig, LivingConfig, OverlayConfig
@@ -15,7 +16,7 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
-from evermap.maps.bodies import squared_length
+from evermap.maps.bodies import log_density
 from evermap.maps.living import LivingMap, Places, rows_among
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.maps.vicinity import Vicinity, near
@@ -118,21 +119,27 @@ class Turned(NamedTuple):
     symmetries: Symmetries
 
     def log_odds(self, landmark: IntArray, places: Places, settings: OverlayConfig) -> FloatArray:
-        """Return (P,) log likelihood ratio of orientations of landmarks (P,) at places, 'unmoved' over 'moved'."""
+        """Return (P,) log likelihood ratio of orientations of landmarks (P,) at places, 'unmoved' over 'moved'.
+
+        By how much unmoved ones seem turned is common to those of a session, and shows in all the others: where these
+        are within a degree of the map, one that is off by twenty has been turned.
+        """
         turn = se3.compose(self.pose_map_session, _turns(self.rotation[landmark]))
         known_turn = self.symmetries[landmark].nearest(_turns(places.rotation), turn)
         off = se3.local(known_turn, turn)[:, 3:]
         known = np.isfinite(places.rotation[:, 0]) & np.isfinite(self.rotation[landmark, 0])
         spread = np.where(known[:, None, None], self.covariance[landmark] + places.rotation_covariance, np.eye(3))
 
-        def log_density(sigmas_rad: tuple[float, ...]) -> FloatArray:
-            each = []
-            for sigma in sigmas_rad:
-                wide = spread + sigma**2 * np.eye(3)
-                each.append(-0.5 * squared_length(off, wide) - 0.5 * np.linalg.slogdet(wide)[1])
-            return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(each)))
-
-        return np.where(known, log_density(settings.stood_rad) - log_density(settings.turned_rad), 0.0)
+        stood, moved = (
+            log_density(off, spread + np.square(sigmas_rad)[:, None, None, None] * np.eye(3))
+            for sigmas_rad in (settings.stood_rad, settings.turned_rad)
+        )
+        log_moved = logsumexp(moved, axis=0) - np.log(len(moved))
+        own = np.zeros((len(self.rotation), len(stood)))  # what each landmark says of the levels
+        np.add.at(own, landmark, np.where(known, np.logaddexp(stood, log_moved), 0.0).T)
+        by_others = (own.sum(axis=0) - own)[landmark].T
+        log_stood = logsumexp(stood + by_others, axis=0) - logsumexp(by_others, axis=0)
+        return np.where(known, log_stood - log_moved, 0.0)
 
 
 def _turns(rotation: FloatArray) -> FloatArray:

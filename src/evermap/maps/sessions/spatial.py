@@ -236,7 +236,7 @@ class SpatialVisit:
             model = learned.watched(model, stamp_s[some], pose[some], detected[some], there[chosen])
             p[mine] = model.p_detect(pose[mine], places.position_m)
         looked = detected | (p >= config.looks.worth_a_look * p.max(initial=0.0))
-        view, place = np.nonzero(looked)
+        view, place = map(np.ascontiguousarray, np.nonzero(looked))
         listed = LooksAt(view, place, p[view, place], detected[view, place])
         heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
         return Watch(stamp_s, listed, np.column_stack([pose[:, 0, 3], pose[:, 1, 3], heading]))

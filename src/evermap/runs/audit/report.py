@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.io.map_formats import SurveyFile, correct_map, write_map_bytes
+from evermap.io.map_formats import SurveyFile, write_corrected
 from evermap.io.spatial import AT, QUATERNION
 from evermap.runs.audit.entries import DECIDED, FEWEST
 from evermap.runs.audit.result import ORDER, Audit, AuditDrive, AuditEntry, EntryState, count_states, format_percent
@@ -240,8 +240,7 @@ def write_audit(
     from evermap.viz.style import house_style, save_png, save_svg
 
     with RunFolder(out, force=force, inputs=inputs) as folder:
-        data = correct_map(file, audit.corrections())
-        written = write_map_bytes(data, folder.path(f"corrected/{file.path.name}"))
+        written = write_corrected(file, audit.corrections(), folder.path(f"corrected/{file.path.name}"))
         figure = plan_of(audit, file)
         with house_style():
             save_png(figure.figure, folder.path("figures/audit.png"))

@@ -433,16 +433,11 @@ def _count(data: CensoredLifetimes, began_s: FloatArray, group: IntArray, hours:
 
 def _describe_hours(hours: HourFit, group: int, clock: Clock) -> dict[str, Any]:
     """Return what is known of the hours of the week of a group, for JSON, with a line for people."""
-    from evermap.maps.lives import Lives, describe_hours
+    from evermap.existence.hours import describe_hours
 
-    factor = np.zeros(0) if hours.rhythm is None else hours.rhythm.log_factor
-    follow = np.flatnonzero(hours.follows)
-    lives = Lives(
-        log_factor=factor, hourly_class_id=follow, hours_known=np.array([hours.n_dated, hours.log_evidence]),
-        class_id=np.arange(len(hours.follows)),
-    )  # fmt: skip
-    by_hour = np.exp(factor).reshape(168, -1).mean(axis=1).round(4).tolist() if hours.follows[group] else None
-    line = "; ".join(describe_hours(lives, clock, group))
+    rhythm, follows = hours.rhythm, bool(hours.follows[group])
+    by_hour = rhythm.hourly_factor.round(4).tolist() if rhythm is not None and follows else None
+    line = "; ".join(describe_hours(hours.n_dated, hours.log_evidence, rhythm, clock, follows=follows))
     return {
         "ends_dated": hours.n_dated,
         "evidence_nats": json_number(hours.log_evidence),

@@ -107,7 +107,9 @@ def _all_grown(seeds: IntArray, gate: float, loose: float, pairs: Any) -> tuple[
     sets, evidence = np.full((len(seeds), LARGEST_SET), -1), np.zeros(len(seeds))
     label = np.empty((len(seeds), pairs.ends.max() + 1), dtype=np.int64)
     for k in range(len(seeds)):
-        found, evidence[k], label[k] = _grown(seeds[k : k + 1], -1, LARGEST_SET, gate, loose, pairs)
+        none: Any = np.int64(-1)  # no literals, for which numba would compile it again
+        most: Any = np.int64(LARGEST_SET)
+        found, evidence[k], label[k] = _grown(seeds[k : k + 1], none, most, gate, loose, pairs)
         sets[k, : len(found)] = found
     return sets, evidence, label
 

@@ -220,8 +220,8 @@ class _SpatialFrame:
         first = np.append(0, np.cumsum(self.n_rows * (OF_SIGHTING + dim)))
         self._seen = SpatialSightings(
             np.zeros(count, dtype=np.int64), np.arange(count), seen.sensor, kind, turned.astype(np.int64),
-            seen.either[0], seen.root, seen.sigma_rad, seen.corner, seen.corner_root, seen.half_m, first,
-            np.ones(count), np.full(3, NEVER), seen.symmetry, of._axis, of._first_turn, of._turns,
+            np.ascontiguousarray(seen.either[0]), seen.root, seen.sigma_rad, seen.corner, seen.corner_root,
+            seen.half_m, first, np.ones(count), np.full(3, NEVER), seen.symmetry, of._axis, of._first_turn, of._turns,
             np.zeros(count, dtype=np.bool_),
         )  # fmt: skip
         most = int(self.n_rows.max(initial=0))
