@@ -357,7 +357,7 @@ def _add_verdict(
     entered: Session, visit: Visit | None, before: LivingMap, config: Config, found: tuple[Finding, ...]
 ) -> Session:
     """Return a session with its verdict, beside the map as it was `before` it; its solution, the `visit`, is asked what
-    it held as stated, but not in traffic (None).
+    it held as stated, but not in traffic (None). One that does not enter the map reports no changes.
     """
     from evermap.explain.causes.suspect import Inputs
     from evermap.explain.scores import ScreenedSession
@@ -369,7 +369,7 @@ def _add_verdict(
     if visit is not None and entered.found and config.slam.explain.on:
         asked = ScreenedSession(session.solution_of(visit), Inputs.of(visit.recording, None))
     slam = _judge(entered.slam, entered.recording, config, expected, found, set_aside=reason, asked=asked)
-    return replace(entered, slam=slam)
+    return session.without_doubted(replace(entered, slam=slam), before, config.living)
 
 
 def refuse_localization(living: LivingMap, config: Config) -> None:

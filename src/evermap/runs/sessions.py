@@ -32,7 +32,7 @@ from evermap.runs.replay import (
 )
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
-from evermap.types import Progress, VerdictKind
+from evermap.types import Progress
 from evermap.valid import check_type
 
 if TYPE_CHECKING:
@@ -83,14 +83,7 @@ class Entered(Shown):
 
     def refusal(self, config: Config | None = None) -> str:
         """Return why the session does not enter the map by itself (`living.accept`), in a line; '' where it does."""
-        if not self.session.found:
-            return self.session.set_aside[0]
-        verdict, accept = self.session.slam.verdict, (config or Config()).living.accept
-        if verdict is None or accept == "any" or verdict.kind is VerdictKind.SOUND:
-            return ""
-        if accept == "weak" and verdict.kind.is_trustworthy:
-            return ""
-        return verdict.text
+        return self.session.refusal((config or Config()).living)
 
     @property
     def grown(self) -> IntArray:

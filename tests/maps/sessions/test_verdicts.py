@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evermap.config import Config
 from evermap.maps.living import LivingMap
+from evermap.maps.sessions.session import without_doubted
+from evermap.maps.store import open_store
 from evermap.pipeline import run_session
-from evermap.types import AnyRecording, Verdict, VerdictKind
+from evermap.runs.replay import enter_again, list_steps
+from evermap.runs.sessions import enter_session
+from evermap.types import AnyRecording, ChangeKind, Verdict, VerdictKind
 from evermap_studies.causes import mistakes as wrong
-from evermap_studies.causes.drives import MAKES, as_recording, simulate
+from evermap_studies.causes.drives import MAKES, Make, as_recording, simulate
 from evermap_studies.causes.mistakes import Mistake
 from evermap_studies.worlds.parking import Parking
 
@@ -20,9 +26,14 @@ MAKE = replace(MAKES["corners"], duration_s=30.0)
 DAY_S = 86400.0
 
 
-def drive(day: int, mistake: Mistake = wrong.nothing) -> AnyRecording:
-    """A drive of a day past the same tags, with other noise of its camera on each."""
-    made = simulate(replace(MAKE, duration_s=30.0 + day), 3, in_map=False)
+def drive(day: int, mistake: Mistake = wrong.nothing, make: Make = MAKE, happen: Any = None) -> AnyRecording:
+    """A drive of a day past the same landmarks, with other noise of its sensor on each, after what happens to them."""
+    make = replace(make, duration_s=30.0 + day)
+    made = simulate(make, 3, in_map=False)
+    if happen is not None:
+        made = wrong.identities_stay(
+            simulate(make, 3, happen(made, np.random.default_rng(1)), in_map=False), np.random.default_rng()
+        )
     read = as_recording(mistake(made, np.random.default_rng(1)))
     assert read.odometry is not None
     frames = replace(read.frames, stamp_s=read.frames.stamp_s + day * DAY_S)
@@ -78,3 +89,65 @@ def test_traffic_is_not_asked_in_a_map_either() -> None:
     session = run_session(street.drive(1, 0.0, (0.0, 0.4)))
     assert session.found
     assert np.isnan(held_of(session.slam.verdict))
+
+
+ANY = Config.model_validate({"living": {"accept": "any"}})
+LASER = MAKES["laser"]
+
+
+@pytest.fixture(scope="module")
+def lit() -> LivingMap:
+    """A map of one drive past poles, in the plane."""
+    return run_session(drive(0, make=LASER)).living
+
+
+def refused_drive(day: int = 1) -> AnyRecording:
+    """Two poles were taken away, and ranges are 5 % long."""
+    return drive(day, wrong.readings(1.05), LASER, wrong.vanishes(2))
+
+
+def test_what_does_not_enter_the_map_reports_no_change(lit: LivingMap) -> None:
+    right = run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
+    assert [change.kind for change in right.changes] == [ChangeKind.VANISHED] * 2
+    assert not right.refusal(Config().living)
+    session = run_session(refused_drive(), lit)
+    assert session.found
+    assert session.slam.verdict is not None
+    assert session.refusal(Config().living) == session.slam.verdict.text
+    assert "0.95" in session.slam.verdict.message or "range_slope = 0.05" in session.slam.verdict.message
+    assert (session.changes, session.slam.changes, session.slam.alternatives) == ((), (), ())
+    assert not len(session.slam.gone)
+    believed = run_session(refused_drive(), lit, ANY)
+    assert not believed.refusal(ANY.living)
+    assert believed.changes == believed.slam.changes
+    assert [change.landmark_ids for change in believed.changes] == [change.landmark_ids for change in right.changes]
+    assert set(believed.slam.gone.landmark_id) == {change.landmark_ids[0] for change in right.changes}
+
+
+def test_what_a_map_has_not_believed_before_stays_gone(lit: LivingMap) -> None:
+    """A session that is refused takes back what it says itself, not what others have said."""
+    since = run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
+    refused = run_session(refused_drive(2), since.living)
+    assert set(refused.slam.gone.landmark_id) == set(since.slam.gone.landmark_id) != set()
+    assert not refused.changes
+
+
+def test_what_is_set_aside_by_its_own_solution_reports_no_change(lit: LivingMap) -> None:
+    """Its result, which is its own, may have found some in the map that was given for that."""
+    entered = run_session(refused_drive(), lit, ANY)
+    lost = replace(entered, found=False, set_aside=("too few", "another map"))
+    kept = without_doubted(lost, lit, ANY.living)
+    assert (kept.changes, kept.slam.changes, len(kept.slam.gone)) == ((), (), 0)
+    assert kept.refusal(ANY.living) == "too few"
+
+
+def test_a_session_of_the_map_reports_its_changes_whatever_is_asked_of_new_ones(tmp_path: Path) -> None:
+    with open_store(tmp_path / "poles.evermap", create=True) as store:
+        for recording in (drive(0, make=LASER), refused_drive()):
+            entered = enter_session(store, recording, ANY)
+            entered.commit(store, ANY)
+        refused = enter_session(store, refused_drive(2))
+        assert refused.changes == refused.session.changes == ()
+        steps = list_steps(store, store.head())
+        again = enter_again(store, steps[1], store.load(1), Config())
+        assert [change.landmark_ids for change in again.changes] == [one.landmark_ids for one in entered.changes] != []

@@ -57,6 +57,7 @@ from evermap.types import (
     Sensor,
     SlamResult,
     SpatialRecording,
+    VerdictKind,
     is_in_space,
     rows_of,
 )
@@ -78,7 +79,8 @@ class Session(Shown):
         recording: as it was used: repaired, with the map's class numbers, without deleted landmarks; rows of `slam`
             that name detections and frames are rows of it.
         slam: trajectory, landmarks and all else, in the map's frame.
-        changes: what appeared, vanished, moved, was exchanged or returned since the session before.
+        changes: what appeared, vanished, moved, was exchanged or returned since the session before; none of a session
+            that its verdict keeps out of the map (`refusal`).
         evidence: what was seen of every clique, frame by frame.
         set_aside: why it was not found, and what to try; empty where it was.
     """
@@ -90,6 +92,17 @@ class Session(Shown):
     changes: tuple[MapChange, ...]
     evidence: Evidence
     set_aside: tuple[str, ...] = ()
+
+    def refusal(self, config: LivingConfig) -> str:
+        """Return why the session does not enter the map by itself (`living.accept`), in a line; '' where it does."""
+        if not self.found:
+            return self.set_aside[0]
+        verdict = self.slam.verdict
+        if verdict is None or config.accept == "any" or verdict.kind is VerdictKind.SOUND:
+            return ""
+        if config.accept == "weak" and verdict.kind.is_trustworthy:
+            return ""
+        return verdict.text
 
 
 def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, LivingMap]:
@@ -489,6 +502,18 @@ def explained(
 def solution_of(visit: Visit) -> AnySession:
     """Return what a session's estimate is, as causes are asked of it."""
     return visit.solved if isinstance(visit, PlanarVisit) else SpatialSession(visit.intake, visit.solved)
+
+
+def without_doubted(session: Session, before: LivingMap, config: LivingConfig) -> Session:
+    """Return a session; where it does not enter the map (`Session.refusal`), which was as `before` it, without what it
+    says has changed: what is not believed is not reported.
+    """
+    if not session.refusal(config):
+        return session
+    known = before.landmarks(p_least=0.0)
+    gone = known.landmark_id[known.p_exists < EXISTS]
+    still = rows_of(session.slam.gone, np.isin(session.slam.gone.landmark_id, gone))
+    return replace(session, slam=replace(session.slam, changes=(), alternatives=(), gone=still), changes=())
 
 
 def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
