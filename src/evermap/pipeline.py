@@ -153,15 +153,14 @@ def _leave_out_motion(case: _Case) -> _Case:
 def _conclude(case: _Case, **more: Any) -> tuple[SlamResult, SessionSolution[Visit]]:
     """Return a case solved, with what exists, faults and verdict; and its solution; `more` is as of `explained`."""
     from evermap.explain.causes.suspect import Inputs
-    from evermap.explain.trial import SessionSolution
     from evermap.maps.sessions import session
     from evermap.slam.space.up import with_known_up
 
     config, prior_map = case.config, case.prior_map
     given = Inputs.of(case.recording, prior_map)
-    visit, result, asked = session.explained(given, config, case.remarks, is_read_well=case.is_read_well, **more)
-    solution = SessionSolution(visit, asked, result)
-    result = replace(session.existing(visit, result, config.living), association=case.evidence)
+    solution = session.explained(given, config, case.remarks, is_read_well=case.is_read_well, **more).best.solution
+    visit, asked = solution.visit, solution.asked
+    result = replace(session.existing(visit, solution.result, config.living), association=case.evidence)
     if prior_map is not None:
         not_missed = [*case.doubled.tolist(), *case.left_out]  # what was read was not missed
         expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]

@@ -16,7 +16,7 @@ from evermap.explain.causes.suspect import Inputs
 from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
 from evermap.explain.scores import ScreenedSession
-from evermap.explain.trial import SessionSolution
+from evermap.explain.trial import Explained, SessionSolution, Trial
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Places, Stays
@@ -448,9 +448,9 @@ def explained(
     is_read_well: bool = False,
     is_suspected: bool = False,
     solution: SessionSolution[Visit] | None = None,
-) -> tuple[Visit, SlamResult, ScreenedSession]:
-    """Return a session solved, its result, and its screen: as given, or under the causes that explain it better
-    (`explain`).
+) -> Explained[Visit]:
+    """Return a session solved, with its result: as given, or under the causes that explain it better (`explain`), its
+    calibration in the units that were given.
 
     Args:
         inputs: with identities.
@@ -488,15 +488,15 @@ def explained(
             raise
     else:
         if not config.slam.explain.on or as_given.result.interrupted or realtime:
-            return as_given.visit, as_given.result, as_given.asked
+            return Explained(Trial(as_given, (), math.nan, 1.0), ())
         found = explain(
             inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well, is_suspected=is_suspected
         )
         assert found is not None
-    best = found.best.solution
     if not found.causes:
-        return best.visit, best.result, best.asked
-    return best.visit, replace(in_given_units(found.best), causes=found.causes), best.asked
+        return found
+    result = replace(in_given_units(found.best), causes=found.causes)
+    return replace(found, best=replace(found.best, solution=replace(found.best.solution, result=result)))
 
 
 def solution_of(visit: Visit) -> AnySession:
@@ -525,7 +525,7 @@ def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
         return session
     given = Inputs.of(session.recording, living.landmarks(p_least=EXISTS))
     try:
-        causes = explained(given, config, ())[1].causes
+        causes = explained(given, config, ()).causes
     except (DataError, NumericalError):
         return session
     return replace(session, slam=replace(session.slam, causes=causes))
