@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evermap import pipeline
 from evermap.config import Config
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.session import without_doubted
+from evermap.maps.sessions import session as session_steps
+from evermap.maps.sessions.session import Session, without_doubted
 from evermap.maps.store import open_store
 from evermap.pipeline import run_session
 from evermap.runs.replay import enter_again, list_steps
@@ -54,15 +56,24 @@ def held_of(verdict: Verdict | None) -> float:
 
 
 @pytest.mark.parametrize(
-    ("mistake", "line"),
+    ("mistake", "line", "value"),
     [
-        (wrong.mounted(yaw=0.15), "mounts of all sensors are -0.1"),
-        (wrong.sized(1.05), "tags are 0.16"),
+        (wrong.mounted(yaw=0.15), "mounts of all sensors are -0.1", -0.15),
+        pytest.param(wrong.sized(1.05), "tags are 0.16", 1.0 / 1.05, marks=pytest.mark.slow),
     ],
 )
-def test_what_a_session_held_wrongly_keeps_it_out_of_the_map(living: LivingMap, mistake: Mistake, line: str) -> None:
-    """Both were sound, seven and eleven times as far off as with the right statement, and entered by themselves."""
+def test_what_a_session_held_wrongly_keeps_it_out_of_the_map(
+    living: LivingMap, mistake: Mistake, line: str, value: float
+) -> None:
+    """Both were sound, seven and eleven times as far off as with the right statement, and entered by themselves. Now
+    the sensor is suspected, and the session is as far off as a right one.
+    """
     session = run_session(drive(1, mistake), living)
+    (cause,) = session.slam.causes
+    assert cause.value == pytest.approx(value, abs=0.003)
+    assert cause.probability > 0.99
+    assert session.refusal(Config().living)
+    assert apart_m(session, run_session(drive(1), living)) < 0.006
     verdict = session.slam.verdict
     assert verdict is not None
     assert verdict.kind is VerdictKind.SENSOR_SUSPECT
@@ -151,3 +162,72 @@ def test_a_session_of_the_map_reports_its_changes_whatever_is_asked_of_new_ones(
         steps = list_steps(store, store.head())
         again = enter_again(store, steps[1], store.load(1), Config())
         assert [change.landmark_ids for change in again.changes] == [one.landmark_ids for one in entered.changes] != []
+
+
+def apart_m(one: Session, other: Session) -> float:
+    """Root mean square of how far apart two solutions have the robot in the same frames [m]."""
+    here, there = (each.slam.trajectory.pose_world_robot[:, :2] for each in (one, other))
+    return float(np.sqrt(np.mean(np.sum(np.square(here - there), axis=1))))
+
+
+@pytest.fixture(scope="module")
+def right(lit: LivingMap) -> Session:
+    return run_session(drive(1, make=LASER), lit)
+
+
+def test_a_late_sensor_is_put_right_as_in_a_recording_by_itself(lit: LivingMap, right: Session) -> None:
+    """It was 'weak', 7.6 cm off, and kept out: nothing said which of two clocks was right."""
+    session = run_session(drive(1, wrong.late(0.1), LASER), lit)
+    assert [(cause.code, cause.subject) for cause in session.slam.causes] == [("clock", "sensor")]
+    assert session.slam.causes[0].value == pytest.approx(0.1, abs=0.01)
+    assert not session.refusal(Config().living)
+    assert apart_m(session, right) < 0.01
+    delay_s = {state.name: state.value for state in session.slam.parameters}["odometry_delay_s"]
+    assert delay_s == pytest.approx(-0.1, abs=0.01)  # of the stamps that were given
+
+
+def test_a_late_sensor_begins_a_map_as_one_in_time_does() -> None:
+    session = run_session(drive(0, wrong.late(0.1), LASER))
+    assert [cause.code for cause in session.slam.causes] == ["clock"]
+    assert not session.refusal(Config().living)
+
+
+def test_what_moved_before_a_late_session_is_reported_where_it_is(lit: LivingMap) -> None:
+    happen = wrong.moves(1, shift_m=0.5)
+    late, in_time = (run_session(drive(1, wrong.late(by_s), LASER, happen), lit) for by_s in (0.1, 0.0))
+    (moved,), (expected,) = late.changes, in_time.changes
+    assert (moved.kind, moved.landmark_ids) == (expected.kind, expected.landmark_ids)
+    assert np.allclose(moved.displacement_m, expected.displacement_m, atol=0.01)
+
+
+def test_a_right_session_is_asked_for_no_cause(lit: LivingMap, right: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session_steps, "find_causes", None)
+    again = run_session(drive(1, make=LASER), lit)
+    assert np.array_equal(again.slam.trajectory.pose_world_robot, right.slam.trajectory.pose_world_robot)
+
+
+@pytest.mark.parametrize(
+    ("of_map", "nats", "told", "is_refused"),
+    [(False, np.nan, ["clock"], False), (True, 50.0, ["clock"], True), (True, np.nan, [], True)],
+)
+def test_a_session_is_entered_anew_for_causes_of_its_own_alone(
+    lit: LivingMap, monkeypatch: pytest.MonkeyPatch, of_map: bool, nats: float, told: list[str], is_refused: bool
+) -> None:
+    """What is wrong with the map is named, and leaves the session as it is, and refused as it is."""
+    solved = list[Any]()
+    localise = pipeline._localise
+    monkeypatch.setattr(pipeline, "_localise", lambda *given: solved.append(given) or localise(*given))
+    find = session_steps.find_causes
+
+    def find_in_map(*given: Any, **more: Any) -> Any:
+        found = find(*given, **more)
+        (taken,) = found.best.taken
+        taken = replace(taken, suspect=replace(taken.suspect, of_map=of_map))
+        causes = tuple(replace(cause, nats=nats) for cause in found.causes)
+        return replace(found, best=replace(found.best, taken=(taken,)), causes=causes)
+
+    monkeypatch.setattr(session_steps, "find_causes", find_in_map)
+    session = run_session(drive(1, wrong.late(0.1), LASER), lit)
+    assert len(solved) == (not of_map)
+    assert [cause.code for cause in session.slam.causes] == told
+    assert bool(session.refusal(Config().living)) == is_refused

@@ -15,6 +15,7 @@ from evermap.explain.answer import in_given_units
 from evermap.explain.causes.suspect import Inputs
 from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
+from evermap.explain.put_right import find_late_sensor
 from evermap.explain.scores import ScreenedSession
 from evermap.explain.trial import Explained, SessionSolution, Trial
 from evermap.maps.bodies import without_missed
@@ -98,7 +99,7 @@ class Session(Shown):
         if not self.found:
             return self.set_aside[0]
         verdict = self.slam.verdict
-        if verdict is None or config.accept == "any" or verdict.kind is VerdictKind.SOUND:
+        if verdict is None or config.accept == "any" or is_sound(self):
             return ""
         if config.accept == "weak" and verdict.kind.is_trustworthy:
             return ""
@@ -523,12 +524,38 @@ def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
     """
     if session.found or not config.slam.explain.on or not len(living.places):
         return session
-    given = Inputs.of(session.recording, living.landmarks(p_least=EXISTS))
+    found = find_causes(session, living, config)
+    return session if found is None else replace(session, slam=replace(session.slam, causes=found.causes))
+
+
+def find_causes(
+    session: Session, living: LivingMap, config: Config, *, is_suspected: bool = False
+) -> Explained[Visit] | None:
+    """Return what explains a session, solved by itself with the map as one that is given; None if nothing can be.
+
+    `is_suspected` is as of `explain`.
+    """
+    expected = living.landmarks(p_least=EXISTS) if len(living.places) else None
     try:
-        causes = explained(given, config, ()).causes
+        return explained(Inputs.of(session.recording, expected), config, (), is_suspected=is_suspected)
     except (DataError, NumericalError):
-        return session
-    return replace(session, slam=replace(session.slam, causes=causes))
+        return None
+
+
+def is_sound(session: Session) -> bool:
+    """Return whether the verdict of a session, if it has one, is that it is sound."""
+    return session.slam.verdict is None or session.slam.verdict.kind is VerdictKind.SOUND
+
+
+def is_doubtful(session: Session) -> bool:
+    """Return whether causes are to be asked of a session with its verdict: it is not sound, or its sensor is late."""
+    return not is_sound(session) or find_late_sensor(session.slam, Inputs.of(session.recording, None)) is not None
+
+
+def with_calibration(session: Session, found: Explained[Visit]) -> Session:
+    """Return a session that was entered without what causes did, with these, and its calibration in the units given."""
+    trial = replace(found.best, solution=replace(found.best.solution, result=session.slam))
+    return replace(session, slam=replace(in_given_units(trial), causes=found.causes))
 
 
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
