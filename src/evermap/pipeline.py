@@ -357,7 +357,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
 def _judge_in_map(
     entered: Session, visit: Visit, before: LivingMap, config: Config, found: tuple[Finding, ...]
 ) -> Session:
-    """Return a session with its verdict; one that is not sound as it is without what causes other than changes did,
+    """Return a session with its verdict; one that can't be trusted as it is without what causes other than changes did,
     where there are any: as `run_slam` solves a recording.
     """
     from evermap.maps.sessions import session
@@ -377,7 +377,7 @@ def _judge_in_map(
             return _add_verdict(again, located.visit, before, config, found)
     named = replace(entered, slam=replace(entered.slam, causes=explained.causes))
     named = _add_verdict(named, visit, before, config, found)
-    return judged if session.is_sound(named) else named  # a solution that was not put right is no better for a cause
+    return judged if session.is_trusted(named) else named  # a solution that was not put right is no better for a cause
 
 
 def _localise(

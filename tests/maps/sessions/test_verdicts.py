@@ -231,3 +231,14 @@ def test_a_session_is_entered_anew_for_causes_of_its_own_alone(
     assert len(solved) == (not of_map)
     assert [cause.code for cause in session.slam.causes] == told
     assert bool(session.refusal(Config().living)) == is_refused
+
+
+def test_what_was_held_is_suspected(living: LivingMap, lit: LivingMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing explains it, the session is refused as it is."""
+    asked = list[bool]()
+    monkeypatch.setattr(session_steps, "find_causes", lambda *_, is_suspected: asked.append(is_suspected))
+    session = run_session(drive(1, wrong.mounted(yaw=0.15)), living)
+    assert held_of(session.slam.verdict) > 0.5
+    assert (session.slam.causes, bool(session.refusal(Config().living))) == ((), True)
+    run_session(drive(1, wrong.late(0.1), LASER), lit)
+    assert asked == [True, False]

@@ -99,7 +99,7 @@ class Session(Shown):
         if not self.found:
             return self.set_aside[0]
         verdict = self.slam.verdict
-        if verdict is None or config.accept == "any" or is_sound(self):
+        if verdict is None or config.accept == "any" or verdict.kind is VerdictKind.SOUND:
             return ""
         if config.accept == "weak" and verdict.kind.is_trustworthy:
             return ""
@@ -542,14 +542,16 @@ def find_causes(
         return None
 
 
-def is_sound(session: Session) -> bool:
-    """Return whether the verdict of a session, if it has one, is that it is sound."""
-    return session.slam.verdict is None or session.slam.verdict.kind is VerdictKind.SOUND
+def is_trusted(session: Session) -> bool:
+    """Return whether the verdict of a session, if it has one, is that it is sound or weak."""
+    return session.slam.verdict is None or session.slam.verdict.kind.is_trustworthy
 
 
 def is_doubtful(session: Session) -> bool:
-    """Return whether causes are to be asked of a session with its verdict: it is not sound, or its sensor is late."""
-    return not is_sound(session) or find_late_sensor(session.slam, Inputs.of(session.recording, None)) is not None
+    """Return whether causes are to be asked of a session with its verdict: it is neither sound nor weak, or its sensor
+    is late.
+    """
+    return not is_trusted(session) or find_late_sensor(session.slam, Inputs.of(session.recording, None)) is not None
 
 
 def with_calibration(session: Session, found: Explained[Visit]) -> Session:
