@@ -17,7 +17,7 @@ from evermap.maps.sessions.session import Session, without_doubted
 from evermap.maps.store import open_store
 from evermap.pipeline import run_session
 from evermap.runs.replay import enter_again, list_steps
-from evermap.runs.sessions import enter_session
+from evermap.runs.sessions import TwiceError, enter_session
 from evermap.types import AnyRecording, ChangeKind, Verdict, VerdictKind
 from evermap_studies.causes import mistakes as wrong
 from evermap_studies.causes.drives import MAKES, Make, as_recording, simulate
@@ -242,3 +242,14 @@ def test_what_was_held_is_suspected(living: LivingMap, lit: LivingMap, monkeypat
     assert (session.slam.causes, bool(session.refusal(Config().living))) == ((), True)
     run_session(drive(1, wrong.late(0.1), LASER), lit)
     assert asked == [True, False]
+
+
+def test_a_copy_of_a_late_session_is_in_the_map_already(tmp_path: Path) -> None:
+    """Its stamps are put right in the map, and are as given where the session is asked for."""
+    late = drive(1, wrong.late(0.1), LASER)
+    with open_store(tmp_path / "poles.evermap", create=True) as store:
+        for recording in (drive(0, make=LASER), late):
+            enter_session(store, recording).commit(store)
+        assert store.log()[-1].provenance.stamp_from_s == late.frames.stamp_s[0]
+        with pytest.raises(TwiceError, match="has the same frames and readings"):
+            enter_session(store, replace(late, name="copy"))
