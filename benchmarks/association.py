@@ -323,7 +323,7 @@ def warehouse(n_places: int, *, p_gone: float = 0.05) -> Lived:
 def lived_through(world: Lived, *, unknown_ids: bool | str) -> dict[str, float]:
     """Enter all sessions; returns how many were found, position error (each aligned) [m], changes by place,
     landmarks in the end and in truth, and CPU seconds."""
-    config = load_config(None, [*world.overrides, f"slam.unknown_ids={str(unknown_ids).lower()}"])
+    config = load_config(None, ["living.accept=any", *world.overrides, f"slam.unknown_ids={str(unknown_ids).lower()}"])
     living, pose, squared, began = world.begun, world.pose_truth_map, list[float](), time.process_time()
     n_entered, n_told, n_true, n_right, n_found = 0, 0, 0, 0, 0
     first, dim = len(world.position_m) - len(world.recordings), world.position_m.shape[2]
@@ -366,7 +366,7 @@ def exchanged_line(world: Lived, column: str) -> str:
     A landmark of the map is what it was in its first session; how many times landmarks were called right and wrong, and
     what was reported of the two in the session after.
     """
-    config = load_config(None, [*world.overrides, "slam.unknown_ids=true"])
+    config = load_config(None, ["living.accept=any", *world.overrides, "slam.unknown_ids=true"])
     names = np.unique(np.concatenate([recording.detections.landmark_id for recording in world.recordings]))
     one, other = _two_alike(world.recordings)
     living, first, called, told = world.begun, dict[int, int](), [0, 0], list[str]()

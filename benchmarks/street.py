@@ -108,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--leaving", type=int, nargs="+", default=[0, 2, 4, 6])
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     chosen = parser.parse_args(arguments)
-    config, total = with_overrides(Config(), chosen.overrides), Counter[str]()
+    config, total = with_overrides(Config(), ["living.accept=any", *chosen.overrides]), Counter[str]()
     for n_leaving in chosen.leaving:
         of_number = Counter[str]()
         for seed in range(chosen.first, chosen.first + chosen.seeds):

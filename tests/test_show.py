@@ -156,7 +156,7 @@ OBJECTS: dict[str, Any] = {
         compare_with_truth(RECORDING, RESULT),
         PiecewiseConstantHazard(EDGES, (1.0,) * N),
         SESSION,
-        Entered(SESSION, LivingMap(), LivingMap(), (NAMED,) * N, ("monday",) * N, 3, {"a": bytes(N)}),
+        Entered(SESSION, LivingMap(), LivingMap(), (NAMED,) * N, ("monday",) * N, 3, {"a": bytes(N)}, (0.0, 1.0)),
         Check("a", "b", {"frames": {"rows": N}}, (Finding("clock", "late " * N),) * N, ("a warning",) * N),
         Up(np.array([0.0, 0.0, 1.0]), 0.02, "imu"),
         StepLifetime.at_points(EDGES[1:], (1.0 / (N - 1),) * (N - 1)),

@@ -153,15 +153,14 @@ def _leave_out_motion(case: _Case) -> _Case:
 def _conclude(case: _Case, **more: Any) -> tuple[SlamResult, SessionSolution[Visit]]:
     """Return a case solved, with what exists, faults and verdict; and its solution; `more` is as of `explained`."""
     from evermap.explain.causes.suspect import Inputs
-    from evermap.explain.trial import SessionSolution
     from evermap.maps.sessions import session
     from evermap.slam.space.up import with_known_up
 
     config, prior_map = case.config, case.prior_map
     given = Inputs.of(case.recording, prior_map)
-    visit, result, asked = session.explained(given, config, case.remarks, is_read_well=case.is_read_well, **more)
-    solution = SessionSolution(visit, asked, result)
-    result = replace(session.existing(visit, result, config.living), association=case.evidence)
+    solution = session.explained(given, config, case.remarks, is_read_well=case.is_read_well, **more).best.solution
+    visit, asked = solution.visit, solution.asked
+    result = replace(session.existing(visit, solution.result, config.living), association=case.evidence)
     if prior_map is not None:
         not_missed = [*case.doubled.tolist(), *case.left_out]  # what was read was not missed
         expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
@@ -318,8 +317,10 @@ def run_session(
         located = planar.localised(alone, living, config)
     found = (*riders, *found)
     entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
-    visit = None if has_traffic(whole) else located.visit
-    return _add_verdict(session.begun_with(entered, whole), visit, living, config, found)
+    if has_traffic(whole):
+        return _add_verdict(session.begun_with(entered, whole), None, living, config, found)
+    judged = _judge_in_map(entered, located.visit, living, config, found)
+    return session.begun_with(judged, whole)
 
 
 @single_threaded()
@@ -350,14 +351,52 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     living = session.with_names_of(living, alone.recording)
     located = planar.localised(alone, living, config)
     entered = session.brought_in(located, living, config.living)
-    return _add_verdict(entered, located.visit, living, config, alone.findings)
+    return _judge_in_map(entered, located.visit, living, config, alone.findings)
+
+
+def _judge_in_map(
+    entered: Session, visit: Visit, before: LivingMap, config: Config, found: tuple[Finding, ...]
+) -> Session:
+    """Return a session with its verdict; one that can't be trusted as it is without what causes other than changes did,
+    where there are any: as `run_slam` solves a recording.
+    """
+    from evermap.maps.sessions import session
+
+    judged = _add_verdict(entered, visit, before, config, found)
+    if not (config.slam.explain.on and entered.found and session.is_doubtful(judged)):
+        return judged
+    explained = session.find_causes(entered, before, config, is_suspected=_is_held(judged.slam))
+    if explained is None or not explained.causes:
+        return judged
+    taken = explained.best.taken
+    if taken and not any(one.suspect.of_map for one in taken):
+        located = _localise(explained.best.inputs.recording, before, config)
+        again = session.brought_in(located, before, config.living)
+        if again.found:
+            again = session.with_calibration(again, explained)
+            return _add_verdict(again, located.visit, before, config, found)
+    named = replace(entered, slam=replace(entered.slam, causes=explained.causes))
+    named = _add_verdict(named, visit, before, config, found)
+    return judged if session.is_trusted(named) else named  # a solution that was not put right is no better for a cause
+
+
+def _localise(
+    recording: AnyRecording, living: LivingMap, config: Config
+) -> Localised[PlanarVisit] | Localised[SpatialVisit]:
+    """Return a recording that was admitted to a map, solved where it lies in it."""
+    from evermap.maps.sessions import boxes, planar
+    from evermap.slam import estimate
+
+    if is_in_space(recording):
+        return boxes.localised(recording, living, config)
+    return planar.localised(estimate.solve(*planar.prepare_alone(recording, config)), living, config)
 
 
 def _add_verdict(
     entered: Session, visit: Visit | None, before: LivingMap, config: Config, found: tuple[Finding, ...]
 ) -> Session:
     """Return a session with its verdict, beside the map as it was `before` it; its solution, the `visit`, is asked what
-    it held as stated, but not in traffic (None).
+    it held as stated, but not in traffic (None). One that does not enter the map reports no changes.
     """
     from evermap.explain.causes.suspect import Inputs
     from evermap.explain.scores import ScreenedSession
@@ -369,7 +408,7 @@ def _add_verdict(
     if visit is not None and entered.found and config.slam.explain.on:
         asked = ScreenedSession(session.solution_of(visit), Inputs.of(visit.recording, None))
     slam = _judge(entered.slam, entered.recording, config, expected, found, set_aside=reason, asked=asked)
-    return replace(entered, slam=slam)
+    return session.without_doubted(replace(entered, slam=slam), before, config.living)
 
 
 def refuse_localization(living: LivingMap, config: Config) -> None:

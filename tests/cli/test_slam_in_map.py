@@ -248,6 +248,22 @@ def test_ranges_in_millimetres_leave_the_map_as_it_is(
     assert run("slam", tmp_path / "long", "--out", tmp_path / "alone", *QUICK).exit_code == 3
 
 
+def test_a_session_that_is_refused_reports_no_change(copy: Path, building: BuildingSimulation, tmp_path: Path) -> None:
+    """Its ranges are 15 % long: what it says has moved, and that one landmark more is there, is believed as little."""
+    other, seen = building.sessions[2], building.sessions[2].detections
+    names = np.where(seen.landmark_id == np.bincount(seen.landmark_id[seen.landmark_id >= 0]).argmax(), 7000, -1)
+    names = np.where(names < 0, seen.landmark_id, names)
+    detections = replace(seen, range_m=1.15 * seen.range_m, landmark_id=names)
+    write_native(replace(other, detections=detections, true_landmarks=None), tmp_path / "long")
+    result = enter(tmp_path / "long", copy, tmp_path / "run", "--set", "slam.explain.on=false")  # as quickly
+    assert result.exit_code == 3
+    assert "the session was set aside, the map is unchanged: " in result.stderr.splitlines()[-1]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["accepted"], summary["changes"], summary["alternatives"]) == (False, [], [])
+    assert summary["counts"]["landmarks_grown"] == 0
+    assert not (tmp_path / "run" / "changes.jsonl").read_text(encoding="utf-8")
+
+
 def test_which_verdicts_enter_is_set(recordings: list[Path], kept: tuple[Path, list[dict[str, Any]]]) -> None:
     """A weak session with 'weak' or 'any', others with 'any'; a commit in spite of it leaves the map as it is."""
     before = digest(kept[0])

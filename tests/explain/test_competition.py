@@ -364,7 +364,7 @@ def test_mounts_that_are_turned_together_are_named() -> None:
 def test_a_step_that_rejects_detections_says_as_much_as_a_fine_one() -> None:
     """A mount turned by 6 mrad moves corners by many times their noise."""
     recording, survey = recorded(World(seed=1), "corners")
-    asked = session.explained(Inputs.of(recording, survey), without_causes(), ())[2]
+    asked = session.explained(Inputs.of(recording, survey), without_causes(), ()).best.solution.asked
     for suspect in list_suspects(asked.inputs, calibrations=True):
         if suspect.code == "mount":
             coarse, fine = (

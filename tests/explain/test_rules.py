@@ -19,7 +19,6 @@ from evermap.explain.evidence import Score, weigh_levels
 from evermap.explain.screens import FAR
 from evermap.explain.trial import (
     Asked,
-    SessionSolution,
     Taken,
     Trial,
     _state_evidence,
@@ -314,8 +313,8 @@ def test_what_is_of_all_has_other_symptoms_than_the_distance_of_one(
 
 def test_evidence_is_that_at_levels_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, config = Inputs.of(World(seed=1, seconds=10.0).plane(), None), Config()
-    visit, result, asked = session.explained(inputs, config, ())
-    solution = SessionSolution(visit, asked, result)
+    solution = session.explained(inputs, config, ()).best.solution
+    asked = solution.asked
     before = weigh_solution(solution, ()).evidence
     gained = weigh_levels(asked.session)
     assert gained > 0.0

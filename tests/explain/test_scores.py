@@ -29,7 +29,8 @@ from .worlds import World
 def scored(recording: AnyRecording, given: Landmarks | None) -> SessionScores:
     """Return what a session tells that is solved as given."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
-    _, result, asked = session.explained(Inputs.of(recording, given), config, ())
+    solution = session.explained(Inputs.of(recording, given), config, ()).best.solution
+    result, asked = solution.result, solution.asked
     return score_session(asked, result.trajectory)
 
 

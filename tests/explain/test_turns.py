@@ -34,7 +34,7 @@ def record(world: World, kind: str) -> Any:
 def score(recording: AnyRecording) -> dict[str, scores.CalibrationScore]:
     """Return what a session tells of odometry that is solved as given, by codes."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
-    asked = session.explained(Inputs.of(recording, None), config, ())[2]
+    asked = session.explained(Inputs.of(recording, None), config, ()).best.solution.asked
     return {one.suspect.code: one for one in score_odometry(asked)}
 
 
@@ -114,7 +114,8 @@ def test_what_is_left_of_a_zero_is_added_to_what_was_undone() -> None:
 
 
 def test_what_is_usual_has_a_prior() -> None:
-    usual = session.explained(Inputs.of(World(seed=1, seconds=10.0).space(), None), Config(), ())[2].usual
+    inputs = Inputs.of(World(seed=1, seconds=10.0).space(), None)
+    usual = session.explained(inputs, Config(), ()).best.solution.asked.usual
     assert [one.suspect.code for one in usual] == ["odometry-scale", "turn-scale", "turn-bias"]
     wide, narrow = (scores._find_shared(usual, share) for share in (1.0, 0.5))
     sigma = np.array([0.15, 0.15, 0.05])

@@ -218,13 +218,14 @@ def write_results(
     from evermap.viz.change_words import explanations, grew
     from evermap.viz.verdict_words import cause_text, further_causes
 
+    is_accepted = None if entered is None else not entered.refusal(asked.config)
     info = RunInfo(
         command=command_line(),
         seeds={"slam": asked.config.slam.seed},
         processing_s=None if asked.realtime else elapsed_s,  # at the recording's pace most of it is waiting
         total_s=elapsed_s,
-        grown=None if entered is None else len(entered.grown),
-        accepted=None if entered is None else not entered.refusal(asked.config),
+        grown=None if entered is None else len(entered.grown) if is_accepted else 0,
+        accepted=is_accepted,
     )
     summary = write_run(out, recording, result, asked.config, info=info, force=asked.force, inputs=asked.inputs)
     for remark in summary["warnings"]:

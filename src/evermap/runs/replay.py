@@ -94,8 +94,9 @@ def enter_again(store: MapStore, step: Step, living: LivingMap, config: Config |
     recording = replace(read_recording_of(store, step.recording, number), robot=robot)
     problem = f"revision {number} cannot be brought in again"
     try:
-        config = settle_space(recording, config or parse_config(step.revision.provenance.config))
-        session = run_session(recording, living, config)
+        config = settle_space(recording, config or parse_config(step.revision.provenance.config)) or Config()
+        accepted = config.living.model_copy(update={"accept": "any"})  # it is in the map: it is not judged again
+        session = run_session(recording, living, config.model_copy(update={"living": accepted}))
     except DataError as error:
         raise UnbridgedError(f"{problem}: {error}") from None
     if session.slam.interrupted:  # half of a session must not take the place of the whole

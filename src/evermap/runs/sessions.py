@@ -32,7 +32,7 @@ from evermap.runs.replay import (
 )
 from evermap.runs.session_clock import place_session
 from evermap.show import Shown
-from evermap.types import Progress, VerdictKind
+from evermap.types import Progress
 from evermap.valid import check_type
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ class Entered(Shown):
         replayed: names of the later sessions that were brought in again.
         parent: revision that it was made from.
         attachments: to commit with it.
+        span_s: first and last stamp of its recording as it was given, by which copies of it are known.
     """
 
     session: Session
@@ -80,17 +81,11 @@ class Entered(Shown):
     replayed: tuple[str, ...]
     parent: int
     attachments: dict[str, bytes]
+    span_s: tuple[float, float]
 
     def refusal(self, config: Config | None = None) -> str:
         """Return why the session does not enter the map by itself (`living.accept`), in a line; '' where it does."""
-        if not self.session.found:
-            return self.session.set_aside[0]
-        verdict, accept = self.session.slam.verdict, (config or Config()).living.accept
-        if verdict is None or accept == "any" or verdict.kind is VerdictKind.SOUND:
-            return ""
-        if accept == "weak" and verdict.kind.is_trustworthy:
-            return ""
-        return verdict.text
+        return self.session.refusal((config or Config()).living)
 
     @property
     def grown(self) -> IntArray:
@@ -120,7 +115,6 @@ class Entered(Shown):
         config, recording = config or Config(), self.session.recording
         if refusal := self.refusal(config):
             raise DataError(f"{recording.name}: does not enter the map: {refusal}", hint=ACCEPT)
-        stamps = recording.frames.stamp_s
         provenance = Provenance(
             kind=RevisionKind.SESSION,
             recording=recording.name,
@@ -128,8 +122,8 @@ class Entered(Shown):
             command=command,
             config=to_toml(config),
             seed=config.slam.seed,
-            stamp_from_s=float(stamps[0]),
-            stamp_to_s=float(stamps[-1]),
+            stamp_from_s=self.span_s[0],
+            stamp_to_s=self.span_s[1],
             wall_s=wall_s,
             robot=recording.robot,
         )
@@ -192,7 +186,7 @@ def enter_session(
     said = newest if not priors else with_priors(newest, priors, (*recording.class_names, *later), worth)
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
-        return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
+        return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data}, _ends(recording))
     return _enter_late(store, head, recording, said, config, data, progress)
 
 
@@ -246,7 +240,7 @@ def _enter_late(
         living = _retold(store, step, living, story, looks)
     session = run_session(recording, living, config, progress=progress)
     if not session.found:
-        return Entered(session, newest, newest, (), (), head, {})
+        return Entered(session, newest, newest, (), (), head, {}, _ends(recording))
     story.append(_chapter(0, start_s, session.changes, living, session.living))
     living = session.living
     looks[0] = session.evidence, living.members
@@ -255,7 +249,7 @@ def _enter_late(
         living = _retold(store, step, living, story, looks)
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
     attached = {RECORDING: data, STORY: pack_story(parent, story), LOOKS: pack_looks(looks)}
-    return Entered(session, newest, living, session.changes, names, head, attached)
+    return Entered(session, newest, living, session.changes, names, head, attached, _ends(recording))
 
 
 def _retold(

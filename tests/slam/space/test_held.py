@@ -39,7 +39,8 @@ def test_scores_of_lengths_are_zero_in_the_mean() -> None:
     seeds = range(6)
     for seed in seeds:
         world = tagged_corridor(seed, n_tags=16, n_frames=200, drift=0.03)
-        _, result, asked = session.explained(Inputs.of(world.recording, None), config, ())
+        solution = session.explained(Inputs.of(world.recording, None), config, ()).best.solution
+        result, asked = solution.result, solution.asked
         for one in score_session(asked, result.trajectory).calibrations:
             score = math.copysign(math.sqrt(2.0 * one.gain), one.value)
             found.setdefault(f"{one.suspect.code} {one.suspect.subject}", []).append(score)

@@ -15,8 +15,9 @@ from evermap.explain.answer import in_given_units
 from evermap.explain.causes.suspect import Inputs
 from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
+from evermap.explain.put_right import find_late_sensor
 from evermap.explain.scores import ScreenedSession
-from evermap.explain.trial import SessionSolution
+from evermap.explain.trial import Explained, SessionSolution, Trial
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Places, Stays
@@ -57,6 +58,7 @@ from evermap.types import (
     Sensor,
     SlamResult,
     SpatialRecording,
+    VerdictKind,
     is_in_space,
     rows_of,
 )
@@ -78,7 +80,8 @@ class Session(Shown):
         recording: as it was used: repaired, with the map's class numbers, without deleted landmarks; rows of `slam`
             that name detections and frames are rows of it.
         slam: trajectory, landmarks and all else, in the map's frame.
-        changes: what appeared, vanished, moved, was exchanged or returned since the session before.
+        changes: what appeared, vanished, moved, was exchanged or returned since the session before; none of a session
+            that its verdict keeps out of the map (`refusal`).
         evidence: what was seen of every clique, frame by frame.
         set_aside: why it was not found, and what to try; empty where it was.
     """
@@ -90,6 +93,17 @@ class Session(Shown):
     changes: tuple[MapChange, ...]
     evidence: Evidence
     set_aside: tuple[str, ...] = ()
+
+    def refusal(self, config: LivingConfig) -> str:
+        """Return why the session does not enter the map by itself (`living.accept`), in a line; '' where it does."""
+        if not self.found:
+            return self.set_aside[0]
+        verdict = self.slam.verdict
+        if verdict is None or config.accept == "any" or verdict.kind is VerdictKind.SOUND:
+            return ""
+        if config.accept == "weak" and verdict.kind.is_trustworthy:
+            return ""
+        return verdict.text
 
 
 def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, LivingMap]:
@@ -435,9 +449,9 @@ def explained(
     is_read_well: bool = False,
     is_suspected: bool = False,
     solution: SessionSolution[Visit] | None = None,
-) -> tuple[Visit, SlamResult, ScreenedSession]:
-    """Return a session solved, its result, and its screen: as given, or under the causes that explain it better
-    (`explain`).
+) -> Explained[Visit]:
+    """Return a session solved, with its result: as given, or under the causes that explain it better (`explain`), its
+    calibration in the units that were given.
 
     Args:
         inputs: with identities.
@@ -475,20 +489,32 @@ def explained(
             raise
     else:
         if not config.slam.explain.on or as_given.result.interrupted or realtime:
-            return as_given.visit, as_given.result, as_given.asked
+            return Explained(Trial(as_given, (), math.nan, 1.0), ())
         found = explain(
             inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well, is_suspected=is_suspected
         )
         assert found is not None
-    best = found.best.solution
     if not found.causes:
-        return best.visit, best.result, best.asked
-    return best.visit, replace(in_given_units(found.best), causes=found.causes), best.asked
+        return found
+    result = replace(in_given_units(found.best), causes=found.causes)
+    return replace(found, best=replace(found.best, solution=replace(found.best.solution, result=result)))
 
 
 def solution_of(visit: Visit) -> AnySession:
     """Return what a session's estimate is, as causes are asked of it."""
     return visit.solved if isinstance(visit, PlanarVisit) else SpatialSession(visit.intake, visit.solved)
+
+
+def without_doubted(session: Session, before: LivingMap, config: LivingConfig) -> Session:
+    """Return a session; where it does not enter the map (`Session.refusal`), which was as `before` it, without what it
+    says has changed: what is not believed is not reported.
+    """
+    if not session.refusal(config):
+        return session
+    known = before.landmarks(p_least=0.0)
+    gone = known.landmark_id[known.p_exists < EXISTS]
+    still = rows_of(session.slam.gone, np.isin(session.slam.gone.landmark_id, gone))
+    return replace(session, slam=replace(session.slam, changes=(), alternatives=(), gone=still), changes=())
 
 
 def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
@@ -498,12 +524,40 @@ def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
     """
     if session.found or not config.slam.explain.on or not len(living.places):
         return session
-    given = Inputs.of(session.recording, living.landmarks(p_least=EXISTS))
+    found = find_causes(session, living, config)
+    return session if found is None else replace(session, slam=replace(session.slam, causes=found.causes))
+
+
+def find_causes(
+    session: Session, living: LivingMap, config: Config, *, is_suspected: bool = False
+) -> Explained[Visit] | None:
+    """Return what explains a session, solved by itself with the map as one that is given; None if nothing can be.
+
+    `is_suspected` is as of `explain`.
+    """
+    expected = living.landmarks(p_least=EXISTS) if len(living.places) else None
     try:
-        causes = explained(given, config, ())[1].causes
+        return explained(Inputs.of(session.recording, expected), config, (), is_suspected=is_suspected)
     except (DataError, NumericalError):
-        return session
-    return replace(session, slam=replace(session.slam, causes=causes))
+        return None
+
+
+def is_trusted(session: Session) -> bool:
+    """Return whether the verdict of a session, if it has one, is that it is sound or weak."""
+    return session.slam.verdict is None or session.slam.verdict.kind.is_trustworthy
+
+
+def is_doubtful(session: Session) -> bool:
+    """Return whether causes are to be asked of a session with its verdict: it is neither sound nor weak, or its sensor
+    is late.
+    """
+    return not is_trusted(session) or find_late_sensor(session.slam, Inputs.of(session.recording, None)) is not None
+
+
+def with_calibration(session: Session, found: Explained[Visit]) -> Session:
+    """Return a session that was entered without what causes did, with these, and its calibration in the units given."""
+    trial = replace(found.best, solution=replace(found.best.solution, result=session.slam))
+    return replace(session, slam=replace(in_given_units(trial), causes=found.causes))
 
 
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:

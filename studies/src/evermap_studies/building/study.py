@@ -191,7 +191,7 @@ def live(story: Story, method: str, tell: Any = None) -> tuple[Row, LivingMap]:
 
     engine = COMPARED[0] if method == UNCHANGED else method
     switches = next(dict(m.switches) for m in METHODS if m.name == engine)
-    config = Config(living=LivingConfig.model_validate(switches))
+    config = Config(living=LivingConfig.model_validate({"accept": "any", **switches}))
     living: LivingMap | None = None
     found: dict[str, list[Any]] = {key: [] for key in ("sessions", "told", "statements", "forecasts")}
     for k, patrol in enumerate(story.patrols):

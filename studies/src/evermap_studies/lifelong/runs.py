@@ -42,7 +42,7 @@ class Contender:
         """Its settings, after those of the world."""
         from evermap.config import load_config
 
-        return load_config(None, [*overrides, *self.overrides])
+        return load_config(None, ["living.accept=any", *overrides, *self.overrides])
 
 
 def _switched(switches: tuple[tuple[str, str | bool], ...]) -> tuple[str, ...]:
