@@ -293,7 +293,7 @@ def test_a_landmark_has_another_size_only_where_all_sides_say_the_same(other: fl
 def test_what_is_of_all_has_other_symptoms_than_the_distance_of_one(
     symptom: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, base = list[bool](), trial(0.0, result=SimpleNamespace(landmarks=()))
+    asked, base = list[bool](), trial(0.0, result=SimpleNamespace(landmarks=(), changes=()))
 
     def screen_plain(*_: object, of_some: bool, **__: object) -> Asked:
         asked.append(of_some)
