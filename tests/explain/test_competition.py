@@ -205,6 +205,7 @@ def test_from_one_side_a_radio_may_have_moved_or_have_a_bias(long_m: float) -> N
     assert 0.1 < cause.probability < 0.9
     assert cause.instead.startswith("landmark 99 moved")
     assert all(change.probability < 0.9 for change in result.changes)
+    assert (result.changes == ()) == (cause.probability > 0.5)  # the likelier is the solution, whatever it leads by
     assert cause.probability + sum(change.probability for change in result.changes) <= 1.0
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.WEAK
