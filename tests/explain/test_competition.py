@@ -16,6 +16,7 @@ from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
 from evermap.explain.scores import ScreenedSession
 from evermap.explain.screens import screen_pairs
+from evermap.explain.seeds import find_single_biases
 from evermap.explain.trial import Budget, SessionSolution, Solve, Trial, refine, solve_trial
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
@@ -26,7 +27,18 @@ from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.session import Visit
 from evermap.slam.clocks import find_delay
 from evermap.slam.pairs import USUAL, pairs_of
-from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
+from evermap.types import (
+    AnyRecording,
+    Cause,
+    ChangeKind,
+    Landmarks,
+    MapChange,
+    Recording,
+    SensorKind,
+    SlamResult,
+    VerdictKind,
+    is_in_space,
+)
 
 from .worlds import SIZE_M, World
 
@@ -170,6 +182,19 @@ def test_a_radio_that_moved_has_no_bias(shift_m: tuple[float, float]) -> None:
     assert [change.landmark_ids for change in result.changes] == [(6,)]
     assert result.changes[0].displacement_m == pytest.approx(shift_m, abs=0.1)
     assert result.changes[0].probability > 0.9
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_first_values_of_a_bias_are_beside_that_of_all(mapped: bool) -> None:
+    """With a map from where that has the radio; without one from where its ranges fit best."""
+    world = World(seed=3)
+    recording, survey = radios(world), world.map_in_plane() if mapped else None
+    every = dict.fromkeys(np.unique(recording.detections.landmark_id).tolist(), 0.3)
+    result = run_slam(with_bias(recording, every), prior_map=survey)
+    nan = float("nan")
+    result = replace(result, changes=(MapChange((6,), ChangeKind.MOVED, nan, 0.0, (0.3, 0.4), 0.0, 0.9),))
+    found = find_single_biases(with_bias(recording, every | {6: 1.3}), result, survey)
+    assert found == {6: pytest.approx(1.0, abs=0.1)}
 
 
 def with_far_radio(world: World, at_m: tuple[float, float], long_m: float) -> Recording:
