@@ -16,6 +16,7 @@ from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.linearise import FINE_STEP, STEP, change_by
 from evermap.explain.scores import ScreenedSession
 from evermap.explain.screens import screen_pairs
+from evermap.explain.seeds import find_single_biases
 from evermap.explain.trial import Budget, SessionSolution, Solve, Trial, refine, solve_trial
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
@@ -26,7 +27,18 @@ from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.session import Visit
 from evermap.slam.clocks import find_delay
 from evermap.slam.pairs import USUAL, pairs_of
-from evermap.types import AnyRecording, Cause, Landmarks, Recording, SensorKind, SlamResult, VerdictKind, is_in_space
+from evermap.types import (
+    AnyRecording,
+    Cause,
+    ChangeKind,
+    Landmarks,
+    MapChange,
+    Recording,
+    SensorKind,
+    SlamResult,
+    VerdictKind,
+    is_in_space,
+)
 
 from .worlds import SIZE_M, World
 
@@ -127,6 +139,116 @@ def test_a_map_says_that_ranges_are_of_another_scale(longer: float) -> None:
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
     assert error_m(result, recording, in_map=True) < ORACLE * error_of_radios_m() + SMALL_M
+
+
+def with_bias(recording: Recording, long_m: dict[int, float]) -> Recording:
+    """The same with ranges of some landmarks longer."""
+    seen = recording.detections
+    by = np.array([long_m.get(one, 0.0) for one in seen.landmark_id.tolist()])
+    return replace(recording, detections=replace(seen, range_m=seen.range_m + by))
+
+
+@pytest.mark.parametrize("long_m", [0.4, -0.3, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_a_radio_whose_ranges_are_too_long_has_not_moved(long_m: float) -> None:
+    world = World(seed=3)
+    recording = with_bias(radios(world), {6: long_m})
+    result = run_slam(recording, prior_map=world.map_in_plane())
+    cause = named(result, "range-bias")
+    assert cause.subject == "6"
+    assert cause.value == pytest.approx(long_m, abs=0.02)
+    assert ("too long" if long_m > 0.0 else "too short") in cause.message
+    assert cause.fix == f"detections.csv: range_m of landmark 6 {'-' if long_m > 0.0 else '+'} {abs(cause.value):.3g}"
+    assert cause.instead.startswith("landmark 6 moved")
+    assert result.changes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
+    assert error_m(result, recording, in_map=True) < ORACLE * error_of_radios_m() + SMALL_M
+
+
+def test_two_radios_are_named() -> None:
+    world = World(seed=4)
+    result = run_slam(with_bias(radios(world), {6: 0.4, 9: -0.3}), prior_map=world.map_in_plane())
+    found = {cause.subject: cause.value for cause in result.causes}
+    assert found == {"6": pytest.approx(0.4, abs=0.02), "9": pytest.approx(-0.3, abs=0.02)}
+    assert result.changes == ()
+
+
+@pytest.mark.parametrize("shift_m", [(0.4, 0.0), pytest.param((0.0, -1.0), marks=pytest.mark.slow)])
+def test_a_radio_that_moved_has_no_bias(shift_m: tuple[float, float]) -> None:
+    """Seen from all around, what it is off by goes with the direction."""
+    world = World(seed=3, moved={6: shift_m})
+    result = run_slam(radios(world), prior_map=world.map_in_plane())
+    assert result.causes == ()
+    assert [change.landmark_ids for change in result.changes] == [(6,)]
+    assert result.changes[0].displacement_m == pytest.approx(shift_m, abs=0.1)
+    assert result.changes[0].probability > 0.9
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_first_values_of_a_bias_are_beside_that_of_all(mapped: bool) -> None:
+    """With a map from where that has the radio; without one from where its ranges fit best."""
+    world = World(seed=3)
+    recording, survey = radios(world), world.map_in_plane() if mapped else None
+    every = dict.fromkeys(np.unique(recording.detections.landmark_id).tolist(), 0.3)
+    result = run_slam(with_bias(recording, every), prior_map=survey)
+    nan = float("nan")
+    result = replace(result, changes=(MapChange((6,), ChangeKind.MOVED, nan, 0.0, (0.3, 0.4), 0.0, 0.9),))
+    if not mapped:  # and not from where it was taken to be
+        there = result.landmarks.position_m + np.where(result.landmarks.landmark_id == 6, 0.6, 0.0)[:, None]
+        result = replace(result, landmarks=replace(result.landmarks, position_m=there))
+    found = find_single_biases(with_bias(recording, every | {6: 1.3}), result, survey)
+    assert found == {6: pytest.approx(1.0, abs=0.1)}
+
+
+def with_far_radio(world: World, at_m: tuple[float, float], long_m: float) -> Recording:
+    """The drive with one more radio, 99, in every frame, whose ranges are longer."""
+    recording = radios(world)
+    seen, sensor = recording.detections, recording.sensor
+    frame = np.arange(len(recording.frames))
+    pose = world.path(recording.frames.stamp_s)
+    eye = pose[:, :2] + transform_plane(
+        np.column_stack([0.0 * pose[:, :2], pose[:, 2]]), np.array(sensor.mount_robot_sensor[:2])
+    )
+    read = np.linalg.norm(eye - at_m, axis=1) + long_m
+    read += 0.02 * np.random.default_rng(world.seed).normal(size=len(frame))
+    order = np.argsort(np.concatenate([seen.frame, frame]), kind="stable")
+    both = seen[np.zeros(len(order), dtype=np.int64)]
+    columns = (
+        (seen.frame, frame), (seen.landmark_id, np.full(len(frame), 99)), (seen.range_m, read),
+        (seen.class_id, np.full(len(frame), seen.class_id[0])),
+    )  # fmt: skip
+    rows = [np.concatenate(pair)[order] for pair in columns]
+    both = replace(both, frame=rows[0], landmark_id=rows[1], range_m=rows[2], class_id=rows[3])
+    return replace(recording, detections=both, sensor=replace(sensor, range_max_m=200.0))
+
+
+@pytest.mark.parametrize("long_m", [0.4, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_from_one_side_a_radio_may_have_moved_or_have_a_bias(long_m: float) -> None:
+    world = World(seed=4)
+    survey = world.map_in_plane()
+    survey = Landmarks.at(np.append(survey.landmark_id, 99), np.append(survey.position_m, [[60.0, 4.0]], axis=0))
+    result = run_slam(with_far_radio(world, (60.0, 4.0), long_m), prior_map=survey)
+    cause = named(result, "range-bias")
+    assert (cause.subject, cause.value) == ("99", pytest.approx(long_m, abs=0.05))
+    assert 0.1 < cause.probability < 0.9
+    assert cause.instead.startswith("landmark 99 moved")
+    assert all(change.probability < 0.9 for change in result.changes)
+    assert (result.changes == ()) == (cause.probability > 0.5)  # the likelier is the solution, whatever it leads by
+    assert cause.probability + sum(change.probability for change in result.changes) <= 1.0
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.WEAK
+    assert cause.message in result.verdict.message
+    assert cause.instead in result.verdict.message
+
+
+def test_ranges_of_all_that_are_too_long_are_no_bias_of_one() -> None:
+    world = World(seed=3)
+    recording = radios(world)
+    every = dict.fromkeys(np.unique(recording.detections.landmark_id).tolist(), 0.3)
+    result = run_slam(with_bias(recording, every), prior_map=world.map_in_plane())
+    assert not [cause for cause in result.causes if cause.code == "range-bias"]
+    assert result.changes == ()
+    assert {one.name: one.value for one in result.parameters}["range_bias_m"] == pytest.approx(0.3, abs=0.03)
 
 
 @functools.cache

@@ -13,7 +13,9 @@ import pytest
 from evermap import run_slam
 from evermap.config import Config, SlamConfig
 from evermap.explain import competition, screens, seeds, triggers
-from evermap.explain.answer import list_causes
+from evermap.explain.answer import list_causes, weigh_changes
+from evermap.explain.causes import list_suspects
+from evermap.explain.causes.sizes import suspect_bias_of_one
 from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.evidence import Score, weigh_levels
 from evermap.explain.screens import FAR
@@ -27,7 +29,7 @@ from evermap.explain.trial import (
     with_information,
 )
 from evermap.maps.sessions import session
-from evermap.types import Cause
+from evermap.types import Cause, ChangeKind, MapChange
 
 from .worlds import World
 
@@ -288,11 +290,49 @@ def test_a_landmark_has_another_size_only_where_all_sides_say_the_same(other: fl
         assert found == pytest.approx(np.log(2.0) - 0.5 * np.log(other), abs=0.05)
 
 
+@pytest.mark.parametrize(("long_m", "is_significant"), [(0.8, True), (-0.5, True), (0.0, False)])
+def test_what_ranges_are_too_long_by_is_fitted_with_the_place(long_m: float, is_significant: bool) -> None:
+    """From a way of 10 m that a radio 6 m beside it sees; some readings are wrong."""
+    along = np.linspace(-5.0, 5.0, 200)
+    eye = np.column_stack([along, 0.5 * np.sin(along)])
+    read_m = np.hypot(along - 1.0, eye[:, 1] - 6.0) + long_m + 0.02 * np.random.default_rng(3).normal(size=200)
+    read_m[::20] += 3.0
+    found = seeds._fit_bias(eye, read_m, np.array([0.5, 6.5]))
+    assert np.isfinite(found) == is_significant
+    if is_significant:
+        assert found == pytest.approx(long_m, abs=0.1)
+
+
+@pytest.mark.parametrize(("behind", "named"), [(-1.0, True), (0.5, True), (-4.0, False)])
+def test_a_change_is_as_probable_as_a_cause_of_the_same_landmark_leaves_it(behind: float, named: bool) -> None:
+    still = run_slam(World(seed=1, seconds=10.0).plane())
+    nan = math.nan
+    moves = tuple(MapChange((one,), ChangeKind.MOVED, nan, 0.0, (0.3, 0.4), 0.0, 0.95) for one in (6, 9))
+    bias = Taken(suspect_bias_of_one("6", ("id", 6.0)), 0.4, 100.0)
+
+    def trial_with(taken: tuple[Taken, ...], changes: tuple[MapChange, ...], evidence: float) -> Trial[Any]:
+        asked = cast("Any", None)
+        return Trial(SessionSolution(None, asked, replace(still, changes=changes)), taken, evidence, 1.0)
+
+    base, rival = trial_with((), moves, 0.0), trial_with((bias,), moves[1:], behind)
+    best, causes = weigh_changes(base, [base, rival], 0.1)
+    share = 1.0 / (1.0 + math.exp(behind))
+    assert [change.probability for change in best.solution.result.changes] == pytest.approx([0.95 * share, 0.95])
+    assert [cause.probability for cause in causes] == ([pytest.approx(1.0 - share)] if named else [])
+    assert all(cause.instead == "landmark 6 moved 0.50 m" for cause in causes)
+    assert weigh_changes(rival, [base, rival], 0.1) == (rival, [])
+
+
+def test_only_radios_have_a_bias_of_their_own() -> None:
+    recording = World(seed=1, seconds=10.0).plane()
+    assert not [one for one in list_suspects(Inputs.of(recording, None)) if one.code == "range-bias"]
+
+
 @pytest.mark.parametrize("symptom", [triggers.SINGLE, triggers.CHANGES])
 def test_what_is_of_all_has_other_symptoms_than_the_distance_of_one(
     symptom: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, base = list[bool](), trial(0.0, result=SimpleNamespace(landmarks=()))
+    asked, base = list[bool](), trial(0.0, result=SimpleNamespace(landmarks=(), changes=()))
 
     def screen_plain(*_: object, of_some: bool, **__: object) -> Asked:
         asked.append(of_some)

@@ -198,6 +198,7 @@ class ExplainConfig(Section):
     late_s: Positive = rule(0.1, "delay of a clock from which it is told as a cause, though estimated anyway [s]")
     map_changed: Share = rule(0.4, "share of a given map that has changed from which the map itself is asked")
     lead_nats: NotNegative = key(6.0, "log evidence by which a cause must win, its price paid [nats]")
+    rival: Share = rule(0.1, "probability from which a cause is named beside a change that may be instead")
     most_causes: Count = rule(2, "causes that are combined, at most")
     most_tried: Count = rule(4, "causes under which a session is solved again, for each that is added, at most")
     most_solutions: Count = rule(12, "solutions in all, at most")

@@ -9,10 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.explain.trial import Taken, Trial, VisitT
-from evermap.types import Cause, ParameterEstimate, SlamResult, is_in_space
+from evermap.explain.triggers import OF_LANDMARKS
+from evermap.types import Cause, ChangeKind, MapChange, ParameterEstimate, SlamResult, is_in_space
 
 CLOCK = "clock"
 """Cause of stamps that are late."""
+LIKELIEST = 50.0
+"""Log odds beyond which no probability changes [nats]."""
 
 
 def find_ratio(state: ParameterEstimate) -> float:
@@ -63,6 +66,62 @@ def _with_own_state(taken: Taken, result: SlamResult) -> tuple[float, float]:
     return state, sigma
 
 
+def list_changes_of(one: Taken, result: SlamResult) -> list[MapChange]:
+    """Return the changes of a result that are of the landmark of a cause."""
+    rows = one.suspect.rows
+    if rows is None or not one.suspect.is_of_landmark:
+        return []
+    return [change for change in result.changes if change.kind in OF_LANDMARKS and rows[1] in change.landmark_ids]
+
+
+def _say_change(change: MapChange) -> str:
+    """Return a change in words, as what a cause may be instead."""
+    how = f"moved {math.hypot(*change.displacement_m):.2f} m"
+    if change.kind is ChangeKind.SWAPPED:
+        how = "exchanged their identities"
+    elif change.kind is ChangeKind.ROTATED:
+        how = "turned, or " + how
+    return f"landmark{'s' if len(change.labels) > 1 else ''} {', '.join(change.labels)} {how}"
+
+
+def weigh_changes(best: Trial[VisitT], weighed: list[Trial[VisitT]], least: float) -> tuple[Trial[VisitT], list[Cause]]:
+    """Return the best trial with its changes as probable as they are beside causes of the same landmarks, and those of
+    these causes that have a probability of `least`.
+
+    A landmark that moved, and one of which all ranges are too long, look alike from one side.
+    """
+    result, changes, causes = best.solution.result, list[MapChange](), list[Cause]()
+    for change in result.changes:
+        rivals = dict[tuple[str, str], tuple[Taken, Trial[VisitT]]]()
+        for trial in weighed:
+            for one in trial.taken:
+                if change not in list_changes_of(one, result) or list_changes_of(one, trial.solution.result):
+                    continue
+                name = one.suspect.code, one.suspect.subject
+                if name not in rivals or trial.beats(rivals[name][1]) > 0.0:
+                    rivals[name] = one, trial
+        odds = [math.exp(min(trial.beats(best), LIKELIEST)) for _, trial in rivals.values()]
+        share = 1.0 / (1.0 + sum(odds))
+        changes.append(replace(change, probability=share * change.probability) if odds else change)
+        for (one, trial), by in zip(rivals.values(), odds, strict=True):
+            if by * share >= least:
+                causes.append(_as_cause(one, trial, by * share, trial.beats(best), _say_change(change)))
+    if all(one is other for one, other in zip(changes, result.changes, strict=True)):
+        return best, causes
+    return replace(best, solution=replace(best.solution, result=replace(result, changes=tuple(changes)))), causes
+
+
+def _as_cause(one: Taken, trial: Trial[VisitT], p: float, nats: float, instead: str) -> Cause:
+    """Return a cause of a trial as it is told, with its probability, what it gains, and what may be instead."""
+    suspect = one.suspect
+    state, sigma = _with_own_state(one, trial.solution.result)
+    value = suspect.shown(state) if suspect.is_continuous else math.nan
+    scale = abs(suspect.shown(state + 1e-6) - suspect.shown(state)) / 1e-6
+    return Cause(
+        suspect.code, suspect.subject, suspect.say(state), value, sigma * scale, p, suspect.fix(state), nats, instead
+    )
+
+
 def _say(trial: Trial[VisitT], own: Sequence[Cause]) -> str:
     """Return the causes of a trial in words: those that it was solved under, and its own scales."""
     taken = [one.suspect.say(_with_own_state(one, trial.solution.result)[0]) for one in trial.taken]
@@ -100,26 +159,23 @@ def list_causes(
     share = np.where(np.isin(np.arange(len(weighed)), [*likeliest.values()]), np.exp(np.minimum(relative, 0.0)), 0.0)
     share /= max(float(share.sum()), 1e-300)
 
-    def weigh(name: tuple[str, str]) -> tuple[float, str]:
-        """Return the probability of a cause, and the words for the best trial without it."""
+    def weigh(name: tuple[str, str], taken: Taken | None = None) -> tuple[float, str]:
+        """Return the probability of a cause, and the words for the best trial without it, with changes of the landmark
+        that the cause is of (`taken`), if it is of one.
+        """
         holds = np.array([name in names for names in named])
-        other = None if holds.all() else int(np.argmax(np.where(holds, -math.inf, relative)))
-        return float(share[holds].sum()), "" if other is None else _say(weighed[other], own[other])
+        if holds.all():
+            return float(share[holds].sum()), ""
+        other = int(np.argmax(np.where(holds, -math.inf, relative)))
+        changes = [] if taken is None else list_changes_of(taken, weighed[other].solution.result)
+        words = (_say(weighed[other], own[other]), *map(_say_change, changes))
+        return float(share[holds].sum()), "; ".join(filter(None, words))
 
     found = []
     gained = math.nan if base is None else best.beats(base)
     for one in best.taken:
-        suspect = one.suspect
-        p, instead = weigh((suspect.code, suspect.subject))
-        state, sigma = _with_own_state(one, best.solution.result)
-        value = suspect.shown(state) if suspect.is_continuous else math.nan
-        scale = abs(suspect.shown(state + 1e-6) - suspect.shown(state)) / 1e-6
-        found.append(
-            Cause(
-                suspect.code, suspect.subject, suspect.say(state), value, sigma * scale,
-                p, suspect.fix(state), gained, instead,
-            )
-        )  # fmt: skip
+        p, instead = weigh((one.suspect.code, one.suspect.subject), one)
+        found.append(_as_cause(one, best, p, gained, instead))
     taken = {one.suspect.code for one in best.taken}
     for cause in find_own(best):
         if cause.code not in taken:

@@ -15,7 +15,7 @@ from functools import partial
 
 from evermap.config import SlamConfig
 from evermap.errors import EvermapError
-from evermap.explain.answer import list_causes
+from evermap.explain.answer import list_causes, list_changes_of, weigh_changes
 from evermap.explain.causes import list_suspects
 from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.put_right import (
@@ -121,6 +121,8 @@ def explain(
     if best is None:
         return None
     causes = list_causes(best, weighed, base, partial(_find_own, config=config))
+    best, rivals = weigh_changes(best, weighed, rules.rival)
+    causes = (*causes, *rivals)
     named = {cause.code for cause in causes}
     others = find_put_right(best.solution.result, best.inputs, config)
     return Explained(best, (*causes, *(one for one in others if one.code not in named)), tuple(weighed))
@@ -155,8 +157,15 @@ def _next_cause(
     own = set[str]() if best is None else {one.code for one in _find_own(best, config)}
 
     def lead(trial: Trial[VisitT]) -> float:
-        """Return by how much a trial must lead: what is as stated is not left for a little, another cause is."""
-        return 0.0 if own and trial.taken[-1].suspect.code not in own else rules.lead_nats
+        """Return by how much a trial must lead: what is as stated is not left for a little, another cause is, and so is
+        a change of a landmark that a cause of the same landmark explains.
+        """
+        last = trial.taken[-1]
+        if best is not None and len(list_changes_of(last, trial.solution.result)) < len(
+            list_changes_of(last, best.solution.result)
+        ):
+            return 0.0
+        return 0.0 if own and last.suspect.code not in own else rules.lead_nats
 
     for ranked in _rank(best, inputs, suspects, config, screens):
         asked = _diverse(ranked, rules.most_tried, tried)

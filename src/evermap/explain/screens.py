@@ -13,6 +13,7 @@ from evermap.config import ExplainConfig, SlamConfig
 from evermap.errors import EvermapError
 from evermap.explain.answer import CLOCK
 from evermap.explain.causes.mounts import MOUNT_M
+from evermap.explain.causes.sizes import shorten_ranges
 from evermap.explain.causes.suspect import LITTLE, RARE_P, Inputs, Suspect, rows_of_kind
 from evermap.explain.evidence import (
     AnySession,
@@ -25,7 +26,7 @@ from evermap.explain.evidence import (
 )
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, solve_nearby
 from evermap.explain.scores import ScreenedSession
-from evermap.explain.seeds import find_mount, find_scales, find_shape, find_single_scales
+from evermap.explain.seeds import find_mount, find_scales, find_shape, find_single_biases, find_single_scales
 from evermap.explain.shape import FEWEST, compare_shapes, find_mirrored_part
 from evermap.explain.trial import FEWER, INLIER, NEAR, Asked, Trial, VisitT, count_changed
 from evermap.explain.triggers import (
@@ -42,7 +43,7 @@ from evermap.slam.clocks import FALLS, find_delay, find_pair_loss, late_by
 from evermap.slam.estimate import Solved, solve
 from evermap.slam.orientations import MIRRORED
 from evermap.slam.pairs import pairs_of
-from evermap.types import FloatArray, IntArray, SlamResult, is_in_space
+from evermap.types import BoolArray, FloatArray, IntArray, SlamResult, is_in_space
 
 FAR = 2.5
 """Standard deviations beforehand beyond which no state is tried at once."""
@@ -50,6 +51,8 @@ LINEAR = 4.0
 """Times that a cause may gain what the linear test says."""
 STRETCHES = frozenset({"tag-size", "range-scale", "sensor-scale"})
 """Causes that stretch detections: of some landmarks, or by some sensors, as of all."""
+BIAS_OF_ONE = "range-bias"
+"""Cause of ranges of one landmark that are all too long by as much."""
 AGREE = 0.25
 """Share of what one of ranges, odometry and map is off by, up to which the other two agree with each other."""
 PLACED, BETTER, ELSEWHERE = 0.6, 0.2, 0.3
@@ -182,7 +185,7 @@ def _by_seeds(
             state if odd == one else math.nan
             for one, state in (("ranges", ranges), ("odometry", driven), ("map", of_map))
         )
-    single: dict[int, float] = {}
+    single, too_long_m = dict[int, float](), dict[int, float]()
     if best is not None:
         result = best.solution.result
         if inputs.prior_map is not None and result.trajectory.frame != "prior_map" and not math.isfinite(scales.by_map):
@@ -192,6 +195,7 @@ def _by_seeds(
             driven = ratio + math.log(states.get("odometry_forward_scale", states.get("odometry_scale", 1.0)))
             of_map = -ratio
         single = find_single_scales(inputs.recording, result)
+        too_long_m = find_single_biases(inputs.recording, result, inputs.prior_map)
     slips = best is not None and is_off_mount(best.solution.result, inputs, config)
     mount = find_mount(inputs.recording, config.check) if slips else np.zeros(3)  # type: ignore[arg-type]
     by_sensor = compare_sensors(inputs)
@@ -200,6 +204,10 @@ def _by_seeds(
         if suspect.code == "mount" and suspect.subject in PLANAR_MOUNT and slips:
             moved = float(mount[PLANAR_MOUNT.index(suspect.subject)])
             found += [(math.inf, suspect, moved)] if abs(moved) > MOUNT_M else []
+            continue
+        if suspect.code == BIAS_OF_ONE and suspect.rows is not None:
+            bias_m = too_long_m.get(int(suspect.rows[1]), math.nan)
+            found += [(math.inf, suspect, bias_m)] if abs(bias_m) > LITTLE * suspect.sigma else []
             continue
         if suspect.rows is not None and suspect.rows[0] == "sensor":
             state = float(by_sensor[int(suspect.rows[1])])
@@ -261,7 +269,7 @@ def screen_continuous(
         return []
     asked = _without_changes(best)
     session, screen = asked.session, asked.screen
-    found, of_all = list[tuple[float, Suspect, float]](), None
+    found, of_all, of_biases = list[tuple[float, Suspect, float]](), None, None
     # what changes explain, a cause must explain, too
     own, changes = best.solution.asked, best.solution.result.changes
     deficit = evidence_at(own.screen.optimum, price_changes(own.session, changes)) - evidence_at(screen.optimum)
@@ -274,11 +282,16 @@ def screen_continuous(
                 gain = gain_by(session, cost, inputs, suspect) * screen.optimum.worth + suspect.log_p
                 found += [(gain, suspect, 0.0)] if gain > 0.0 else []
             continue
-        if suspect.rows is None or of_all is None:
+        if suspect.code == BIAS_OF_ONE:
+            if of_biases is None:
+                together = replace(suspect, undo=partial(shorten_ranges, of=None))
+                of_biases = change_by(session, screen, inputs, together)
+            direction = None if of_biases is None else of_biases * _of_one(screen, session, inputs, suspect)
+        elif suspect.rows is None or of_all is None:
             direction = change_by(session, screen, inputs, suspect)
             of_all = direction if suspect.code in STRETCHES and suspect.rows is None else of_all
         else:  # each detection stretches by itself
-            direction = of_all * screen.of_detections(rows_of_kind(inputs.recording, suspect.rows)[used_rows(session)])
+            direction = of_all * _of_one(screen, session, inputs, suspect)
         if direction is None:
             continue
         score = screen.score(direction, suspect.sigma**-2)
@@ -290,6 +303,11 @@ def screen_continuous(
         if earns and (not of_noise or _may_relieve(session, inputs, suspect, state, config.explain)):
             found.append((gain + suspect.log_p, suspect, state))
     return sorted(found, key=lambda each: -each[0])
+
+
+def _of_one(screen: Screen, session: AnySession, inputs: Inputs, suspect: Suspect) -> BoolArray:
+    """Return (R,) which residuals are of the detections that a cause is of."""
+    return screen.of_detections(rows_of_kind(inputs.recording, suspect.rows)[used_rows(session)])
 
 
 def _may_relieve(session: AnySession, inputs: Inputs, suspect: Suspect, state: float, rules: ExplainConfig) -> bool:

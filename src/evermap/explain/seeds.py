@@ -5,6 +5,7 @@
 * Two sightings of one landmark and the odometry between them: ranges against the odometry.
 * Landmarks of a solution that was not found in a map, against the map: all lengths.
 * Directions from several poses meet at the landmark, which says how far it was: ranges of one landmark.
+* Ranges alone of one landmark against its distance from the poses: what they are too long by.
 * Two sightings of one landmark and the odometry between them, in turns: where the sensor sits on the robot.
 """
 
@@ -17,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import CheckConfig
+from evermap.estimate.robust import MEDIAN_TO_SIGMA
 from evermap.estimate.tie import find_nearest
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import FALLS, find_pair_loss
@@ -24,6 +26,7 @@ from evermap.slam.mistake_search import find_motion
 from evermap.slam.mistakes import HONEST, Mistake
 from evermap.slam.pairs import off, pairs_of
 from evermap.types import (
+    ANY_BEARING_RAD,
     UNKNOWN,
     AnyRecording,
     BoolArray,
@@ -50,6 +53,10 @@ FEWEST_VIEWS, PARALLAX = 6, 0.02
 ALIKE, ALIKE_SHARE = 0.1, 0.15
 """Difference of logarithms of that distance over the ranges, and share of it, within which four fifths of the views
 agree on a size."""
+BIAS_STEPS, ALONG_ONE = 20, 1e-6
+"""Steps towards the place of a landmark and what its ranges are too long by; and the least share of the views by which
+these are not seen along one line.
+"""
 MOUNT_STEPS = 8
 """Steps towards the place of a sensor."""
 MOST_PAIRS = 4000
@@ -268,6 +275,59 @@ def find_single_scales(recording: AnyRecording, result: SlamResult) -> dict[int,
         if math.isfinite(ratio):
             found[int(name)] = ratio
     return found
+
+
+def find_single_biases(recording: AnyRecording, result: SlamResult, given: Landmarks | None) -> dict[int, float]:
+    """Return by how much ranges of landmarks in the plane are too long [m], from the poses of the solution: of those
+    that are seen by ranges alone, and that changed or most of whose detections were rejected.
+
+    A landmark of the given map is where that has it, another one where its ranges fit best, with what they are too long
+    by.
+    """
+    if is_in_space(recording) or not len(result.trajectory):
+        return {}
+    seen, path, found = recording.detections, result.trajectory, dict[int, float]()
+    kept = np.zeros(len(seen), dtype=np.bool_)
+    kept[result.innovations.detection[result.innovations.p_inlier >= 0.5]] = True
+    changed = {one for change in result.changes for one in change.landmark_ids}
+    states = {one.name: one.value for one in result.parameters}
+    read_m = (seen.range_m - states.get("range_bias_m", 0.0)) / (1.0 + states.get("range_slope", 0.0))
+    robot = path.pose_world_robot[find_nearest(path.stamp_s, recording.frames.stamp_s[seen.frame])]
+    eye = se2.compose(robot, np.array(recording.sensor.mount_robot_sensor, dtype=np.float64))[:, :2]
+    without_bearing = np.isnan(seen.bearing_rad) | (seen.sigma_bearing_rad == ANY_BEARING_RAD)
+    by_range = without_bearing & (seen.landmark_id != UNKNOWN)
+    places = result.landmarks if given is None or path.frame != "prior_map" else given
+    for name in np.unique(seen.landmark_id[by_range]).tolist():
+        mine = np.flatnonzero(by_range & (seen.landmark_id == name))
+        if len(mine) < FEWEST_VIEWS or not (name in changed or np.mean(kept[mine]) < 0.5):
+            continue
+        if not len(place := places.position_m[places.landmark_id == name]):
+            continue
+        if places is given:
+            found[name] = float(np.median(read_m[mine] - np.linalg.norm(eye[mine] - place[0, :2], axis=1)))
+        else:
+            found[name] = _fit_bias(eye[mine], read_m[mine], place[0, :2])
+    return found
+
+
+def _fit_bias(eye: FloatArray, read_m: FloatArray, place: FloatArray) -> float:
+    """Return by how much ranges (M,) from positions (M, 2) are too long, from a first place (2,) to the one that fits
+    them best (Gauss-Newton with Cauchy's weights); nan if it is not significant.
+    """
+    at = np.append(place, 0.0)
+    for _ in range(BIAS_STEPS):
+        away = at[:2] - eye
+        far = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        left = read_m - far - at[2]
+        slope = np.column_stack([away / far[:, None], np.ones(len(far))])
+        scale = max(float(np.median(np.abs(left))), 1e-3)
+        weight = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2)
+        normal = slope.T @ (weight[:, None] * slope)
+        if np.linalg.eigvalsh(normal)[0] < ALONG_ONE * weight.sum():
+            return math.nan
+        at += np.linalg.solve(normal, slope.T @ (weight * left))
+    sigma = MEDIAN_TO_SIGMA * scale * float(np.sqrt(np.linalg.inv(normal)[2, 2]))
+    return float(at[2]) if abs(at[2]) > TIMES_SIGMA * sigma else math.nan
 
 
 def _rays(

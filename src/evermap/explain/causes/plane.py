@@ -17,7 +17,12 @@ from evermap.explain.causes.odometry import (
     suspect_odometry_scale,
     suspect_turn_scale,
 )
-from evermap.explain.causes.sizes import stretch_ranges, suspect_size_of_kind, suspect_size_of_one
+from evermap.explain.causes.sizes import (
+    stretch_ranges,
+    suspect_bias_of_one,
+    suspect_size_of_kind,
+    suspect_size_of_one,
+)
 from evermap.explain.causes.suspect import (
     SCALE,
     UNIT_P,
@@ -62,7 +67,10 @@ def suspect_in_plane(recording: Recording, *, calibrations: bool) -> Iterable[Su
             say_always(name_fix(mistake)), pairs=False, shows=not bearings,
         )  # fmt: skip
     for identity in () if calibrations else list_often_seen(recording):
-        yield suspect_size_of_one(names.get(identity, str(identity)), stretch_ranges, ("id", identity), "")
+        name, of = names.get(identity, str(identity)), ("id", float(identity))
+        yield suspect_size_of_one(name, stretch_ranges, of, "")
+        if not bearings:  # with directions a place shows by one look, and what is off is a size
+            yield suspect_bias_of_one(name, of)
     for row, name in enumerate(recording.class_names):
         yield suspect_size_of_kind(f"class {name}", stretch_ranges, ("class", row), "")
 

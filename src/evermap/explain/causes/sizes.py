@@ -1,4 +1,4 @@
-"""Sizes of tags, and scales of what sensors measure."""
+"""Sizes of tags, scales of what sensors measure, and what ranges of one landmark are too long by."""
 
 from __future__ import annotations
 
@@ -16,6 +16,16 @@ from evermap.types import BoolArray, SpatialRecording
 
 ONE_TAG = 0.3
 """Standard deviation of the logarithm of the size of one tag, or of one kind of tags."""
+ONE_BIAS_M = 0.5
+"""Standard deviation of what all ranges of one landmark are too long by. A delay of its antenna that is 1 ns off, of a
+two-way exchange, is .15 to .3 m, and .2 m of concrete in the line of sight (relative permittivity 6) are .3 m; both, or
+two walls, are met as well."""
+ONE_BIAS_P = 3e-4
+"""Probability beforehand of that, of each landmark: as that one of eight has moved by itself before a session, which is
+`p_moved` / 4 over their number (`ChangesConfig`). It is met as often as other usual causes (`USUAL_P`), and is of one.
+"""
+LEAST_RANGE_M = 1e-3
+"""Range that is left, at least, when a bias is taken off."""
 
 
 def suspect_size_of_one(subject: str, stretch: Callable[..., Inputs], of: tuple[str, float], key: str) -> Suspect:
@@ -32,6 +42,24 @@ def suspect_size_of_one(subject: str, stretch: Callable[..., Inputs], of: tuple[
         lambda s: f"landmark {subject} is {math.exp(s):.4g} times as large, or as far, as the sensor takes it to be",
         lambda s: f"[tags.sizes] {subject} = {float(key) * math.exp(s):.4g}" if key else "the size of this tag",
         ONE_TAG, math.exp, rows=of,
+    )  # fmt: skip
+
+
+def suspect_bias_of_one(subject: str, of: tuple[str, float]) -> Suspect:
+    """Return that all ranges of one landmark, a radio, are too long or too short by as many metres.
+
+    Its price is that of a move: where the two look alike, neither is preferred.
+
+    Args:
+        subject: its name.
+        of: which detections are of it, as `Suspect.rows`.
+    """
+    return Suspect(
+        "range-bias", subject, ONE_BIAS_P, partial(shorten_ranges, of=of),
+        lambda s: f"ranges of landmark {subject} are {abs(s):.3g} m too {'long' if s > 0.0 else 'short'}: the delay of "
+        "its antenna, or a wall in the line of sight",
+        lambda s: f"detections.csv: range_m of landmark {subject} {'-' if s > 0.0 else '+'} {abs(s):.3g}",
+        ONE_BIAS_M, rows=of,
     )  # fmt: skip
 
 
@@ -87,6 +115,14 @@ def stretch_ranges(inputs: Inputs, state: float, of: tuple[str, float] | None) -
         recording=replace(recording, detections=further),
         stretched=inputs.stretched + state * mine,
     )
+
+
+def shorten_ranges(inputs: Inputs, state: float, of: tuple[str, float] | None) -> Inputs:
+    """Return the same with ranges in the plane, those of `rows_of_kind`, shorter by `state` metres."""
+    recording: Any = inputs.recording
+    mine, seen = rows_of_kind(recording, of), recording.detections
+    shorter = np.where(mine, np.maximum(seen.range_m - state, LEAST_RANGE_M), seen.range_m)
+    return replace(inputs, recording=replace(recording, detections=replace(seen, range_m=shorter)))
 
 
 def stretch_positions(inputs: Inputs, state: float, of: tuple[str, float] | None) -> Inputs:

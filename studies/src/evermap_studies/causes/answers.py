@@ -82,6 +82,7 @@ ANSWERS = {
         MENDED, _SCALES + "baseline", "range", "range_slope range_scale odometry_forward_scale odometry_scale"
     ),
     "range bias": _answer(MENDED, "range-bias range-offset", "range", "range_bias_m"),
+    "range bias of one": _answer(MENDED, "range-bias", "range"),
     "tag size": _answer(MENDED, _SIZES + "range-scale length-unit", "size", "range_scale odometry_scale"),
     "size of one": _answer(MENDED, _SIZES + "tag-size-one", "size"),
     "size of a kind": _answer(MENDED, _SIZES + "tag-size-kind tag-size-class", "size"),

@@ -353,6 +353,15 @@ def _causes() -> list[World]:
     some.add("stereo", "baseline 6 % long", "range scale", wrong.baseline(1.06), seeds=5, values=(1.06, 1 / 1.06, 0.06))
     some.add("laser uwb", "ranges 0.3 m long", "range bias", wrong.readings(add_m=0.3), seeds=5, values=(0.3, -0.3))
     some.add(
+        "uwb",
+        "one anchor's ranges 0.4 m long",
+        "range bias of one",
+        wrong.bias_of_one(0.4),
+        seeds=5,
+        values=(0.4, -0.4),
+        within=0.15,
+    )
+    some.add(
         "corners",
         "one tag of another size",
         "size of one",

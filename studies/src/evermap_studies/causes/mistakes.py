@@ -165,6 +165,18 @@ def readings(length: float = 1.0, add_m: float = 0.0, sign: float = 1.0, turn_ra
     return make
 
 
+def bias_of_one(add_m: float) -> Mistake:
+    """Make all ranges of one landmark that is seen often longer."""
+
+    def make(drive: Drive, rng: np.random.Generator) -> Drive:
+        one = int(rng.choice(most_seen(drive, float(drive.odometry_s[-1]) / 2)) + 1)
+        value = drive.value.copy()
+        value[drive.landmark == one, 0] += add_m
+        return replace(drive, value=value)
+
+    return make
+
+
 def odometer(
     forward: float = 1.0, turn: float = 1.0, lateral: float | None = None, bias: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Mistake:
