@@ -21,6 +21,7 @@ from evermap.explain.evidence import Score, weigh_levels
 from evermap.explain.screens import FAR
 from evermap.explain.trial import (
     Asked,
+    SessionSolution,
     Taken,
     Trial,
     _state_evidence,
