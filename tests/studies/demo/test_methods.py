@@ -15,7 +15,7 @@ from evermap_studies.demo.scenario import CLASSES
 
 def test_methods_differ_in_their_switches_only() -> None:
     default = method_named("evermap").config()
-    assert default.living == LivingConfig()
+    assert default.living == LivingConfig(accept="any")
     for method in METHODS:
         config = method.config()
         assert config.slam == default.slam

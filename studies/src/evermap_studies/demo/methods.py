@@ -28,11 +28,13 @@ class Method:
     is_told: bool = False
 
     def config(self) -> Config:
-        """Settings: the defaults but for the switches, and the simulated sensor's true metre."""
+        """Settings: the defaults but for the switches, the simulated sensor's true metre, and a map that goes on
+        whatever the verdict.
+        """
         from evermap.config import CalibrationConfig, Config, LivingConfig, SlamConfig
 
         slam = SlamConfig(calibration=CalibrationConfig(fix={"range_slope": 0.0}))
-        living: LivingConfig = LivingConfig.model_validate(dict(self.switches))
+        living: LivingConfig = LivingConfig.model_validate({"accept": "any", **dict(self.switches)})
         return Config(slam=slam, living=living)
 
 
