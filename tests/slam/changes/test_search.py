@@ -42,7 +42,7 @@ def test_search_finds_the_best_of_all_hypotheses(worlds: int) -> None:
         expected = [row[tuple(label)] for label in hypotheses.label[:50]]
         np.testing.assert_allclose(hypotheses.gain[:50], expected, atol=1e-5)
         found += np.array_equal(hypotheses.label[0], labels[best])
-    assert found >= worlds - 1
+    assert found >= 0.975 * worlds
 
 
 def test_weights_of_what_was_kept_are_nearly_those_of_everything() -> None:
