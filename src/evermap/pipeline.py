@@ -377,7 +377,7 @@ def _judge_in_map(
             return _add_verdict(again, located.visit, before, config, found)
     named = replace(entered, slam=replace(entered.slam, causes=explained.causes))
     named = _add_verdict(named, visit, before, config, found)
-    return judged if session.is_trusted(named) else named  # a solution that was not put right is no better for a cause
+    return judged if named.slam.is_trustworthy else named  # a solution that was not put right is no better for a cause
 
 
 def _localise(

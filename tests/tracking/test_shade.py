@@ -101,7 +101,7 @@ def sees(view: View, *at_m: tuple[float, float, float]) -> list[bool]:
 def test_a_box_hides_what_is_behind_it_and_nothing_else() -> None:
     ball = View.ball(np.array([1.0, 0.0, 1.5]), 40.0, 0.9)
     turned = np.array([[4.0, 2.0, 1.6, 0.5 * np.pi]])  # 4 m across the line of sight
-    view = ball.behind(np.array([[11.0, 0.0, 0.8]]), turned)
+    view = ball.hide_behind(np.array([[11.0, 0.0, 0.8]]), turned)
     behind, beside, before, above, itself = (
         (21.0, 3.5, 0.8),
         (21.0, 4.6, 0.8),
@@ -110,12 +110,12 @@ def test_a_box_hides_what_is_behind_it_and_nothing_else() -> None:
         (11.0, 0.0, 0.8),
     )
     assert sees(view, behind, beside, before, above, itself) == [False, True, True, True, True]
-    below = ball.behind(np.array([[11.0, 0.0, 3.0]]), turned)  # a bridge
+    below = ball.hide_behind(np.array([[11.0, 0.0, 3.0]]), turned)  # a bridge
     assert sees(below, behind) == [True]
-    back = ball.behind(np.array([[-9.0, 0.0, 0.8]]), turned)  # its bearings lie on both sides of half a turn
+    back = ball.hide_behind(np.array([[-9.0, 0.0, 0.8]]), turned)  # its bearings lie on both sides of half a turn
     assert sees(back, (-19.0, 1.0, 0.8), (-19.0, -1.0, 0.8), behind) == [False, False, True]
-    assert sees(ball.behind(np.array([[1.2, 0.0, 1.0]]), turned), behind, before) == [True, True]  # on the sensor
-    both = view.behind(np.array([[-9.0, 0.0, 0.8]]), turned)
+    assert sees(ball.hide_behind(np.array([[1.2, 0.0, 1.0]]), turned), behind, before) == [True, True]  # on the sensor
+    both = view.hide_behind(np.array([[-9.0, 0.0, 0.8]]), turned)
     assert sees(both, behind, (-19.0, 1.0, 0.8), beside) == [False, False, True]
 
 
@@ -127,7 +127,7 @@ def test_what_a_turned_box_hides_is_what_lines_of_sight_through_it_lead_to() -> 
         middle = eye + [9.0 * np.cos(away), 9.0 * np.sin(away), 0.2]
         turn = away + random.uniform(-0.5, 0.5, 10)
         at = eye + np.column_stack([20.0 * np.cos(turn), 20.0 * np.sin(turn), np.zeros(10)])
-        view = View.ball(eye, 40.0, 0.9).behind(middle[None], box[None])
+        view = View.ball(eye, 40.0, 0.9).hide_behind(middle[None], box[None])
         hidden = [not is_in_sight(eye, one, middle[None], box) for one in at]
         found.append((view.probability(at) == 0.0).tolist() == hidden)
     assert np.mean(found) > 0.95  # points along a line miss what it cuts by a corner
@@ -136,7 +136,7 @@ def test_what_a_turned_box_hides_is_what_lines_of_sight_through_it_lead_to() -> 
 def test_a_saved_tracker_knows_what_it_did_not_see(tmp_path: Path) -> None:
     """Also a memory of views without shades is read, as older ones are."""
     memory, again, older = (ViewMemory(3.0, n_recent=2) for _ in range(3))
-    shaded = View.ball(np.zeros(3), 30.0, 0.9).behind(np.array([[10.0, 0.0, 0.0]]), CAR[None])
+    shaded = View.ball(np.zeros(3), 30.0, 0.9).hide_behind(np.array([[10.0, 0.0, 0.0]]), CAR[None])
     for k in range(8):
         memory.add(float(k), shaded)
     again.restore(memory.columns())

@@ -33,7 +33,6 @@ from evermap.cli.recordings import (
     Shifts,
     Start,
     ask,
-    is_trustworthy,
     read_inputs,
     refuse_unread,
     write_results,
@@ -272,7 +271,7 @@ def _run_in_map(
             _commit(entered, store, map_file, config, elapsed_s)
             if begun_from is not None:
                 _tell_corrected(begun_from, entered.living.landmarks())
-        return is_trustworthy(result)
+        return result.is_trustworthy
 
 
 def _tell_corrected(survey: Landmarks, mapped: Landmarks) -> None:

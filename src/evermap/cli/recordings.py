@@ -199,11 +199,6 @@ def write_condensed(recording: AnyRecording, path: Path) -> None:
     say(f"wrote the session for a map to {path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 
-def is_trustworthy(result: SlamResult) -> bool:
-    """Return whether the verdict of a run lets its result be used."""
-    return result.verdict is None or result.verdict.kind.is_trustworthy
-
-
 def write_results(
     out: Path,
     recording: AnyRecording,

@@ -27,7 +27,6 @@ from evermap.cli.recordings import (
     RunRequest,
     Shifts,
     ask,
-    is_trustworthy,
     read_inputs,
     refuse_unread,
     write_results,
@@ -133,4 +132,4 @@ def _run_alone(recording: AnyRecording, prior: Landmarks | None, out: Path, aske
     write_results(out, recording, result, asked, time.perf_counter() - start)
     if result.interrupted:
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
-    return is_trustworthy(result)
+    return result.is_trustworthy

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from evermap.cli.options import AsJson, ConfigFile, Force, Settings, UnknownIds, argument, default_out
-from evermap.cli.recordings import Out, RunRequest, ask, is_trustworthy, refuse_unread, write_results
+from evermap.cli.recordings import Out, RunRequest, ask, refuse_unread, write_results
 from evermap.cli.terminal import EXIT_UNTRUSTWORTHY, progress_bar, warm_up
 from evermap.errors import ConfigError
 
@@ -78,4 +78,4 @@ def _run_together(paths: Sequence[Path], out: Path | None, asked: RunRequest) ->
     elapsed_s = time.perf_counter() - start
     for number, result in results.items():
         write_results(folders[number], recordings[number], result, asked, elapsed_s)
-    return all(map(is_trustworthy, results.values()))
+    return all(one.is_trustworthy for one in results.values())

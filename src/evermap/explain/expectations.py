@@ -80,7 +80,7 @@ def compare_detections(recording: AnyRecording, result: SlamResult) -> Compared:
     else:
         seen = recording.detections
         expected = _predict_readings(pose, places.position_m[row], recording, result.parameters)
-        range_m, known = expected[:, 0], _has_bearing(recording)[detection]
+        range_m, known = expected[:, 0], has_bearing(recording)[detection]
         bearing = np.where(known, seen.bearing_rad[detection], expected[:, 1])
         read = _points(seen.range_m[detection], bearing)
         expected = _points(range_m, expected[:, 1])
@@ -98,7 +98,7 @@ def locate_detections(recording: AnyRecording, parameters: tuple[ParameterEstima
     """
     if not is_in_space(recording):
         seen = recording.detections
-        bearing = np.where(_has_bearing(recording), seen.bearing_rad, np.nan)
+        bearing = np.where(has_bearing(recording), seen.bearing_rad, np.nan)
         return np.asarray(se2.transform(*_correct_readings(seen.range_m, bearing, recording, parameters)))
     from evermap.slam.space.intake import positions_of, without_range
 
@@ -126,7 +126,8 @@ def find_poses_at(path: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, Bo
     return at, np.asarray(np.abs(path.stamp_s[row] - stamp_s) <= FARTHEST_S)
 
 
-def _has_bearing(recording: Recording) -> BoolArray:
+def has_bearing(recording: Recording) -> BoolArray:
+    """Return (M,) whether detections in the plane were read with a bearing."""
     seen = recording.detections
     return np.isfinite(seen.bearing_rad) & ~(seen.sigma_bearing_rad >= ANY_BEARING_RAD)
 
@@ -148,7 +149,7 @@ def _predict_readings(
     pose: FloatArray, place_m: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
 ) -> FloatArray:
     """Return (K, 2) ranges and bearings as the estimated sensor reads them without noise (`slam.calibration.SPECS`)."""
-    value = _PlanarCalibration(parameters)
+    value = PlanarCalibration(parameters)
     x, y = se2.transform(se2.inverse(se2.compose(pose, value.find_mount(recording))), place_m).T
     range_m, bearing = np.hypot(x, y), np.arctan2(y, x)
     read_m = value["range_bias_m"] + range_m * value.find_factor(bearing)
@@ -159,13 +160,13 @@ def _correct_readings(
     range_m: FloatArray, bearing_rad: FloatArray, recording: Recording, parameters: tuple[ParameterEstimate, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the mount (3,), and points (M, 2) in the frame of the sensor that it would read so (M,), (M,)."""
-    value = _PlanarCalibration(parameters)
+    value = PlanarCalibration(parameters)
     bearing = bearing_rad - value["bearing_bias_rad"]
     read = (range_m - value["range_bias_m"]) / value.find_factor(bearing)
     return value.find_mount(recording), _points(np.maximum(read, 1e-3), bearing)
 
 
-class _PlanarCalibration:
+class PlanarCalibration:
     """Values of the estimated calibration of a sensor in the plane, by name; 0 of what was not estimated."""
 
     def __init__(self, parameters: tuple[ParameterEstimate, ...]) -> None:

@@ -20,13 +20,13 @@ import numpy as np
 from evermap.config import CheckConfig
 from evermap.estimate.robust import MEDIAN_TO_SIGMA
 from evermap.estimate.tie import find_nearest
+from evermap.explain.expectations import USED, PlanarCalibration, has_bearing
 from evermap.geometry import se2, se3
 from evermap.slam.clocks import FALLS, find_pair_loss
 from evermap.slam.mistake_search import find_motion
 from evermap.slam.mistakes import HONEST, Mistake
 from evermap.slam.pairs import off, pairs_of
 from evermap.types import (
-    ANY_BEARING_RAD,
     UNKNOWN,
     AnyRecording,
     BoolArray,
@@ -260,11 +260,8 @@ def find_single_scales(recording: AnyRecording, result: SlamResult) -> dict[int,
 
     By where the directions from the poses of the solution meet.
     """
-    seen, innovations = recording.detections, result.innovations
-    path, found = result.trajectory, dict[int, float]()
-    good = innovations.p_inlier >= 0.5
-    kept = np.zeros(len(seen), dtype=np.bool_)
-    kept[innovations.detection[good]] = True
+    seen, path, found = recording.detections, result.trajectory, dict[int, float]()
+    kept = _find_kept(recording, result)
     eye, along, range_m, known = _rays(recording, path.stamp_s, path.pose_world_robot)
     names = np.unique(seen.landmark_id[known])
     for name in names.tolist():
@@ -287,15 +284,13 @@ def find_single_biases(recording: AnyRecording, result: SlamResult, given: Landm
     if is_in_space(recording) or not len(result.trajectory):
         return {}
     seen, path, found = recording.detections, result.trajectory, dict[int, float]()
-    kept = np.zeros(len(seen), dtype=np.bool_)
-    kept[result.innovations.detection[result.innovations.p_inlier >= 0.5]] = True
+    kept = _find_kept(recording, result)
     changed = {one for change in result.changes for one in change.landmark_ids}
-    states = {one.name: one.value for one in result.parameters}
-    read_m = (seen.range_m - states.get("range_bias_m", 0.0)) / (1.0 + states.get("range_slope", 0.0))
+    sensor = PlanarCalibration(result.parameters)
+    read_m = (seen.range_m - sensor["range_bias_m"]) / (1.0 + sensor["range_slope"])
     robot = path.pose_world_robot[find_nearest(path.stamp_s, recording.frames.stamp_s[seen.frame])]
     eye = se2.compose(robot, np.array(recording.sensor.mount_robot_sensor, dtype=np.float64))[:, :2]
-    without_bearing = np.isnan(seen.bearing_rad) | (seen.sigma_bearing_rad == ANY_BEARING_RAD)
-    by_range = without_bearing & (seen.landmark_id != UNKNOWN)
+    by_range = ~has_bearing(recording) & (seen.landmark_id != UNKNOWN)
     places = result.landmarks if given is None or path.frame != "prior_map" else given
     for name in np.unique(seen.landmark_id[by_range]).tolist():
         mine = np.flatnonzero(by_range & (seen.landmark_id == name))
@@ -308,6 +303,13 @@ def find_single_biases(recording: AnyRecording, result: SlamResult, given: Landm
         else:
             found[name] = _fit_bias(eye[mine], read_m[mine], place[0, :2])
     return found
+
+
+def _find_kept(recording: AnyRecording, result: SlamResult) -> BoolArray:
+    """Return (M,) which detections the estimator used."""
+    kept = np.zeros(len(recording.detections), dtype=np.bool_)
+    kept[result.innovations.detection[result.innovations.p_inlier >= USED]] = True
+    return kept
 
 
 def _fit_bias(eye: FloatArray, read_m: FloatArray, place: FloatArray) -> float:

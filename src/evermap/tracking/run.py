@@ -372,7 +372,7 @@ def _follow(
             view = View.ball(*around) if sees is None else sees.view(k, *around)
             if followed is not None and table.box is not None:
                 there = followed.p_exists >= IS_THERE  # also what is missed in this frame hides what is behind it
-                view = view.behind(followed.position_m[there], followed.box[there])
+                view = view.hide_behind(followed.position_m[there], followed.box[there])
         found[rows], events = tracker.step(
             stamp_s,
             table.position_m[rows],

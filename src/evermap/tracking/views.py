@@ -79,7 +79,7 @@ class View:
 
         return cls(centre_m, reach_m, within, (p_detect, yaw_rad, fov_rad, beside_rad))
 
-    def behind(self, middle_m: FloatArray, box: FloatArray) -> Self:
+    def hide_behind(self, middle_m: FloatArray, box: FloatArray) -> Self:
         """Return the view without what is behind boxes with middles (M, 3) and lengths, widths, heights, yaws (M, 4).
 
         What is nearer than the far end of a box, or seen above it, is in view.
@@ -96,9 +96,9 @@ class View:
         half_m = 0.5 * height[:, 0]
         columns = [bearing + 0.5 * (low + high), 0.5 * (high - low), far_m, z_m - half_m, z_m + half_m]
         shade = np.column_stack(columns)
-        return self.shaded(shade[high - low < np.pi])  # who stands within a box sees what is around it
+        return self.hide(shade[high - low < np.pi])  # a sensor within a box sees what is around it
 
-    def shaded(self, shade: FloatArray) -> Self:
+    def hide(self, shade: FloatArray) -> Self:
         """Return the view without what is hidden, as `shade` says."""
         if not len(shade):
             return self
@@ -234,5 +234,5 @@ def _views_of(columns: Mapping[str, FloatArray], name: str) -> list[tuple[float,
     for k, (stamp_s, x, y, z, reach_m, p_detect, *angles) in enumerate(columns[name].tolist()):
         around = np.array([x, y, z]), reach_m, p_detect
         view = View.ball(*around) if angles[1] == 2.0 * np.pi else View.sector(*around, *angles)
-        found.append((stamp_s, view.shaded(shade[shade[:, 0] == k, 1:])))
+        found.append((stamp_s, view.hide(shade[shade[:, 0] == k, 1:])))
     return found

@@ -334,6 +334,11 @@ class SlamResult(Shown):
     association: AssociationEvidence | None = None
 
     @property
+    def is_trustworthy(self) -> bool:
+        """Whether the verdict, where there is one, lets the result be used as it is."""
+        return self.verdict is None or self.verdict.kind.is_trustworthy
+
+    @property
     def undecided(self) -> tuple[Undecided, ...]:
         """Return errors that only show together, where the readings say that one is another than stated."""
         by_name = {one.name: one for one in self.parameters}

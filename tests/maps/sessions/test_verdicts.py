@@ -46,11 +46,11 @@ def drive(day: int, mistake: Mistake = wrong.nothing, make: Make = MAKE, happen:
 @pytest.fixture(scope="module")
 def living() -> LivingMap:
     first = run_session(drive(0))
-    assert held_of(first.slam.verdict) == 0.0
+    assert find_held(first.slam.verdict) == 0.0
     return first.living
 
 
-def held_of(verdict: Verdict | None) -> float:
+def find_held(verdict: Verdict | None) -> float:
     assert verdict is not None
     return next((one.value for one in verdict.symptoms if one.code == "held"), np.nan)
 
@@ -82,14 +82,14 @@ def test_what_a_session_held_wrongly_keeps_it_out_of_the_map(
 
 def test_a_right_session_holds_what_is_right(living: LivingMap) -> None:
     session = run_session(drive(1), living)
-    assert held_of(session.slam.verdict) == 0.0
+    assert find_held(session.slam.verdict) == 0.0
     assert session.slam.verdict is not None
     assert session.slam.verdict.kind is VerdictKind.SOUND
 
 
 def test_nothing_is_asked_where_no_cause_is(living: LivingMap) -> None:
     settings = Config.model_validate({"slam": {"explain": {"on": False}}})
-    assert np.isnan(held_of(run_session(drive(1), living, settings).slam.verdict))
+    assert np.isnan(find_held(run_session(drive(1), living, settings).slam.verdict))
 
 
 def test_traffic_is_not_asked_in_a_map_either() -> None:
@@ -99,7 +99,7 @@ def test_traffic_is_not_asked_in_a_map_either() -> None:
         street.park(random, slot, -1e6, 1e6)
     session = run_session(street.drive(1, 0.0, (0.0, 0.4)))
     assert session.found
-    assert np.isnan(held_of(session.slam.verdict))
+    assert np.isnan(find_held(session.slam.verdict))
 
 
 ANY = Config.model_validate({"living": {"accept": "any"}})
@@ -112,7 +112,7 @@ def lit() -> LivingMap:
     return run_session(drive(0, make=LASER)).living
 
 
-def refused_drive(day: int = 1) -> AnyRecording:
+def make_refused_drive(day: int = 1) -> AnyRecording:
     """Two poles were taken away, and ranges are 5 % long."""
     return drive(day, wrong.readings(1.05), LASER, wrong.vanishes(2))
 
@@ -121,14 +121,14 @@ def test_what_does_not_enter_the_map_reports_no_change(lit: LivingMap) -> None:
     right = run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
     assert [change.kind for change in right.changes] == [ChangeKind.VANISHED] * 2
     assert not right.refusal(Config().living)
-    session = run_session(refused_drive(), lit)
+    session = run_session(make_refused_drive(), lit)
     assert session.found
     assert session.slam.verdict is not None
     assert session.refusal(Config().living) == session.slam.verdict.text
     assert "0.95" in session.slam.verdict.message or "range_slope = 0.05" in session.slam.verdict.message
     assert (session.changes, session.slam.changes, session.slam.alternatives) == ((), (), ())
     assert not len(session.slam.gone)
-    believed = run_session(refused_drive(), lit, ANY)
+    believed = run_session(make_refused_drive(), lit, ANY)
     assert not believed.refusal(ANY.living)
     assert believed.changes == believed.slam.changes
     assert [change.landmark_ids for change in believed.changes] == [change.landmark_ids for change in right.changes]
@@ -138,14 +138,14 @@ def test_what_does_not_enter_the_map_reports_no_change(lit: LivingMap) -> None:
 def test_what_a_map_has_not_believed_before_stays_gone(lit: LivingMap) -> None:
     """A session that is refused takes back what it says itself, not what others have said."""
     since = run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
-    refused = run_session(refused_drive(2), since.living)
+    refused = run_session(make_refused_drive(2), since.living)
     assert set(refused.slam.gone.landmark_id) == set(since.slam.gone.landmark_id) != set()
     assert not refused.changes
 
 
 def test_what_is_set_aside_by_its_own_solution_reports_no_change(lit: LivingMap) -> None:
     """Its result, which is its own, may have found some in the map that was given for that."""
-    entered = run_session(refused_drive(), lit, ANY)
+    entered = run_session(make_refused_drive(), lit, ANY)
     lost = replace(entered, found=False, set_aside=("too few", "another map"))
     kept = without_doubted(lost, lit, ANY.living)
     assert (kept.changes, kept.slam.changes, len(kept.slam.gone)) == ((), (), 0)
@@ -154,10 +154,10 @@ def test_what_is_set_aside_by_its_own_solution_reports_no_change(lit: LivingMap)
 
 def test_a_session_of_the_map_reports_its_changes_whatever_is_asked_of_new_ones(tmp_path: Path) -> None:
     with open_store(tmp_path / "poles.evermap", create=True) as store:
-        for recording in (drive(0, make=LASER), refused_drive()):
+        for recording in (drive(0, make=LASER), make_refused_drive()):
             entered = enter_session(store, recording, ANY)
             entered.commit(store, ANY)
-        refused = enter_session(store, refused_drive(2))
+        refused = enter_session(store, make_refused_drive(2))
         assert refused.changes == refused.session.changes == ()
         steps = list_steps(store, store.head())
         again = enter_again(store, steps[1], store.load(1), Config())
@@ -238,7 +238,7 @@ def test_what_was_held_is_suspected(living: LivingMap, lit: LivingMap, monkeypat
     asked = list[bool]()
     monkeypatch.setattr(session_steps, "find_causes", lambda *_, is_suspected: asked.append(is_suspected))
     session = run_session(drive(1, wrong.mounted(yaw=0.15)), living)
-    assert held_of(session.slam.verdict) > 0.5
+    assert find_held(session.slam.verdict) > 0.5
     assert (session.slam.causes, bool(session.refusal(Config().living))) == ((), True)
     run_session(drive(1, wrong.late(0.1), LASER), lit)
     assert asked == [True, False]

@@ -110,14 +110,14 @@ def test_a_body_that_turned_between_two_looks_has_two_rests() -> None:
 
 
 @pytest.fixture(scope="module")
-def entered() -> tuple[YardDrive, em.Session]:
+def standing_yard() -> tuple[YardDrive, em.Session]:
     """A yard in which nothing drives, entered into a new map."""
     drive = simulate_yard(replace(DRIVING, standing=True), seed=0)[0]
     return drive, em.run_session(drive.recording)
 
 
-def test_a_yard_that_stands_is_mapped_as_if_nothing_was_stated(entered: tuple[YardDrive, em.Session]) -> None:
-    drive, stated = entered[0], entered[1].slam
+def test_a_yard_that_stands_is_mapped_as_if_nothing_was_stated(standing_yard: tuple[YardDrive, em.Session]) -> None:
+    drive, stated = standing_yard[0], standing_yard[1].slam
     unstated = em.run_slam(
         replace(drive.recording, objects=drive.recording.objects[:0]), Config.model_validate({"slam": {"plane": False}})
     )
@@ -141,8 +141,8 @@ def test_a_body_is_one_thing_in_a_living_map() -> None:
     assert all(len(np.unique(clique[body == one])) == 1 for one in np.unique(body[body != UNKNOWN]))
 
 
-def test_a_new_landmark_has_fellows_that_are_out_of_view(entered: tuple[YardDrive, em.Session]) -> None:
-    drive, living = entered[0], entered[1].living
+def test_a_new_landmark_has_fellows_that_are_out_of_view(standing_yard: tuple[YardDrive, em.Session]) -> None:
+    drive, living = standing_yard[0], standing_yard[1].living
     known = living.members.landmark_id
     new = np.setdiff1d(np.flatnonzero(drive.body_of_tag != UNKNOWN), known)
     assert len(new)

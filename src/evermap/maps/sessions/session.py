@@ -542,16 +542,12 @@ def find_causes(
         return None
 
 
-def is_trusted(session: Session) -> bool:
-    """Return whether the verdict of a session, if it has one, is that it is sound or weak."""
-    return session.slam.verdict is None or session.slam.verdict.kind.is_trustworthy
-
-
 def is_doubtful(session: Session) -> bool:
     """Return whether causes are to be asked of a session with its verdict: it is neither sound nor weak, or its sensor
     is late.
     """
-    return not is_trusted(session) or find_late_sensor(session.slam, Inputs.of(session.recording, None)) is not None
+    slam = session.slam
+    return not slam.is_trustworthy or find_late_sensor(slam, Inputs.of(session.recording, None)) is not None
 
 
 def with_calibration(session: Session, found: Explained[Visit]) -> Session:
