@@ -19,6 +19,7 @@ class Method:
         says: what it does about change, half a sentence.
         switches: fields of `LivingConfig` that differ from the defaults.
         is_told: before every session it is told which landmarks changed since the last one, and forgets them.
+        asks_causes: whether a session that contradicts the map is asked for causes other than changes.
     """
 
     name: str
@@ -26,14 +27,17 @@ class Method:
     says: str
     switches: tuple[tuple[str, str | bool], ...] = ()
     is_told: bool = False
+    asks_causes: bool = False
 
     def config(self) -> Config:
         """Settings: the defaults but for the switches, the simulated sensor's true metre, and a map that goes on
         whatever the verdict.
         """
-        from evermap.config import CalibrationConfig, Config, LivingConfig, SlamConfig
+        from evermap.config import CalibrationConfig, Config, ExplainConfig, LivingConfig, SlamConfig
 
-        slam = SlamConfig(calibration=CalibrationConfig(fix={"range_slope": 0.0}))
+        slam = SlamConfig(
+            calibration=CalibrationConfig(fix={"range_slope": 0.0}), explain=ExplainConfig(on=self.asks_causes)
+        )
         living: LivingConfig = LivingConfig.model_validate({"accept": "any", **dict(self.switches)})
         return Config(slam=slam, living=living)
 
@@ -61,7 +65,7 @@ METHODS: tuple[Method, ...] = (
         "every landmark has several places, of which hits and misses choose one",
         (("search", "gate"), ("existence", False), *_UNLEARNED),
     ),
-    Method("evermap", "evermap", "all of it in one model, and a joint search over what moved"),
+    Method("evermap", "evermap", "all of it in one model, and a joint search over what moved", asks_causes=True),
     Method("oracle", "oracle", "static SLAM that is told the truth about every change", _STATIC, is_told=True),
 )
 
