@@ -192,6 +192,39 @@ def test_classes_lean_on_each_other_and_a_new_one_on_all() -> None:
     assert float(two_days[2][0]) < 0.4
 
 
+def two_looks(seen_again: list[int], gone: list[int], back: float) -> StayAges:
+    """Stays of some classes at two looks, a day apart: how many were there at both, and how many at the first alone;
+    what had left between them may have been back.
+    """
+    rows = [(DAY_S, np.inf, DAY_S, n, k) for k, n in enumerate(seen_again)]
+    rows += [(100.0, DAY_S, 100.0, n, k) for k, n in enumerate(gone) if n]
+    last, end, gap, weight, group = (np.array(column) for column in zip(*rows, strict=True))
+    some, column = len(rows), np.ones((len(rows), 1))
+    return StayAges(
+        0.0 * column, last[:, None], end[:, None], weight.astype(float), group, gap[:, None] * np.ones((1, 2)),
+        np.full(some, back), np.zeros(some),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("back", [0.3, 0.5])
+def test_what_all_were_seen_again_of_lasts_though_any_may_have_been_away(back: float) -> None:
+    """Likelihoods with unseen returns are convex far out, of many classes at once: together they lose no prior."""
+    seen_again, gone = [12, 5, 6, 6, 8, 3], [0, 3, 0, 2, 2, 2]
+    found = learn_hazards(two_looks(seen_again, gone, back), [None] * 6, USUAL)
+    day, two_days = (np.array([float(one.survival(age_s)[0]) for one in found]) for age_s in (DAY_S, 2.0 * DAY_S))
+    assert (day[[0, 2]] > 0.88).all(), "of 12 and of 6 none had gone"
+    assert (two_days[[0, 2]] / day[[0, 2]] > 0.92).all()
+    share = np.array(seen_again) / (np.array(seen_again) + np.array(gone))
+    assert (np.abs(day[:6] - share) < 0.16).all()  # classes lean on each other
+    of_class = [
+        StayLikelihood(two_looks(seen_again, gone, back).of_group(k), one.edges_s) for k, one in enumerate(found[:6])
+    ]
+    expected = [float(one.weight @ each.values(one.rates)) for one, each in zip(found, of_class, strict=False)]
+    usual = learn_hazards(StayAges.empty(), [], USUAL, found[0].edges_s)[0]
+    before = [float(usual.weight @ each.values(usual.rates)) for each in of_class]
+    assert sum(expected) > sum(before), "what was seen is more probable by what was learned from it (Gibbs)"
+
+
 STATED = {
     "steps": PiecewiseConstantHazard((0.0, 2.0 * DAY_S), (0.0, 10.0 / DAY_S)),
     "two kinds": TWO_KINDS,

@@ -53,6 +53,9 @@ FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
 """Standard deviations at which exact densities are computed, and those between; the two which tell whether to."""
 STRAIGHT, HEAVIEST = 0.1, 16.0
 """Difference of log densities there up to which the normal one is kept; and the largest weight, in mean ones."""
+NO_LESS = 1e-6
+"""Share of the prior's information below zero that is rounding. That of no class may be less: what each of many loses of
+the prior would be lost to all of them together, which leaves a posterior that is none."""
 _SETTLED = 1e-4
 _EXACT = 1e-12
 """Relative error of a stated hazard."""
@@ -243,7 +246,7 @@ class _Together:
                 value, gradients, curvatures = self.every.by_class(base * np.exp(v @ columns.T), self.row)
             value -= 0.5 * of_shared * float(s @ s) + 0.5 * of_own * float(np.square(v - s).sum())
             informations = np.array(
-                [drop_negative(one, of_own * np.eye(r)) for one in -columns.T @ curvatures @ columns]
+                [drop_negative(one, NO_LESS * of_own * np.eye(r)) for one in -columns.T @ curvatures @ columns]
             )
             informations = informations.reshape(n, r, r)
             return value if np.isfinite(value) else -np.inf, gradients @ columns, informations
