@@ -241,6 +241,18 @@ def test_from_one_side_a_radio_may_have_moved_or_have_a_bias(long_m: float) -> N
     assert cause.instead in result.verdict.message
 
 
+@pytest.mark.parametrize("seed", [5, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_right_radio_far_to_one_side_has_not_moved(seed: int) -> None:
+    """Its first bearing is a guess, metres off across the line of sight, where ranges are another line's."""
+    world, at_m = World(seed=seed), (96.0, 4.0)
+    survey = world.map_in_plane()
+    survey = Landmarks.at(np.append(survey.landmark_id, 99), np.append(survey.position_m, [at_m], axis=0))
+    result = run_slam(with_far_radio(world, at_m, 0.0), prior_map=survey)
+    assert result.changes == result.causes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SOUND
+
+
 def test_ranges_of_all_that_are_too_long_are_no_bias_of_one() -> None:
     world = World(seed=3)
     recording = radios(world)

@@ -287,8 +287,9 @@ def _piece(
     )
     sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
     position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
-    ranged = np.bincount(part.landmark_row, part.has_bearing, minlength=count) == 0
-    position[ranged] = estimate.landmark[landmark[ranged]]  # ranges alone are linear near where it is only
+    # ranges alone are linear near where it is only; one bearing of a landmark is a first value (`slam.ranges`)
+    ranged = np.bincount(part.landmark_row, part.has_bearing, minlength=count) <= 1
+    position[ranged] = estimate.landmark[landmark[ranged]]
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
     yield MS_OF_DETECTION * len(used)
