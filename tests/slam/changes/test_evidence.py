@@ -90,6 +90,20 @@ def test_ranges_alone_are_linear_where_the_estimate_is_whatever_the_first_bearin
     assert (off_m[evidence.window > 0] < 1e-12).all()
 
 
+def test_ranges_of_what_moved_are_linear_where_it_is_by_then() -> None:
+    world = make_world(4, n_poses=24, n_landmarks=5, p_seen=1.0, turn_radps=0.2)
+    sigma = np.full((len(world.problem.reading), 2), np.nan)
+    sigma[:, 1] = ANY_BEARING_RAD
+    problem, bounds = replace(world.problem, sigma_given=sigma), np.array([0, 8, 16, 24])
+    moved = replace(world.truth, landmark=np.vstack([world.truth.landmark, world.truth.landmark[2] + [0.7, -0.4]]))
+    row = np.array([[0, 1, 2, 3, 4], [0, 1, 5, 3, 4], [0, 1, 5, 3, 4]])
+    evidence = exhausted(landmark_evidence(problem, moved, world.noise, problem.prior, bounds, 3, row=row))
+    at = evidence.position - evidence.position[0]
+    expected = moved.landmark[row[evidence.window, evidence.landmark]]
+    scale = np.linalg.norm(at[1]) / np.linalg.norm(expected[1] - expected[0])  # of all by the prior of the metre
+    np.testing.assert_allclose(at, scale * (expected - expected[0]), atol=1e-9)
+
+
 def test_windows_with_tied_copies_are_one_window() -> None:
     """Measured exactly, so that copies are where the landmark is."""
     world = make_world(3, n_poses=24, n_landmarks=5, prior=KNOWN_SIZE, noisy=0.0, p_seen=1.0, turn_radps=0.2)
