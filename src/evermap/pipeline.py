@@ -180,13 +180,13 @@ def _leave_out_carried(
     from evermap.slam.votes import without_identities
 
     as_given = case, result, solution, ()
-    if case.config.slam.unknown_ids is True or not (suspects := find_carried(result, case.read)):
+    if case.config.slam.unknown_ids is True or not (suspects := find_carried(result, case.read, case.prior_map)):
         return as_given
     names = tuple(one.landmark_id for one in suspects)
     rest, read = without_identities(case.recording, names), without_identities(case.read, names)
     without = replace(case, recording=rest, read=read, left_out=names)
     result, solution = _conclude(without)
-    confirmed = find_carried(result, case.read)  # along poses that they do not bend
+    confirmed = find_carried(result, case.read, case.prior_map)  # along poses that they do not bend
     if tuple(one.landmark_id for one in confirmed) != names:
         return as_given
     return without, result, solution, tuple(name_carried(one, case.read) for one in confirmed)

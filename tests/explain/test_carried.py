@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap import Config, run_slam
-from evermap.explain.carried import APART_M, AT_TWO, CARRIED, ELSEWHERE, _fill_places, find_carried
+from evermap.explain.carried import APART_M, AT_TWO, CARRIED, ELSEWHERE, _fill_places, _moves_in_view, find_carried
 from evermap.explain.expectations import find_instants, find_poses_at, locate_detections
 from evermap.geometry import se2
 from evermap.slam.plane import in_its_space
@@ -112,6 +112,76 @@ def test_what_moves_between_two_places_is_not_carried_about(make: Any, how: Any)
     wrong = carry(make(), how)
     assert CARRIED not in list_codes(run_slam(wrong))
     assert not find_carried(solve(make), in_its_space(wrong, Config().slam))
+
+
+def move_twice(stamp_s: np.ndarray, at_s: float = 18.0) -> np.ndarray:
+    """Displaced before the drive, and once more at an instant."""
+    return np.where(stamp_s[:, None] > at_s, [[-0.6, 1.4]], [[1.2, 0.9]])
+
+
+@cache
+def solve_in_map(make: Callable[[], Any]) -> SlamResult:
+    given = make()
+    return run_slam(given, prior_map=given.true_landmarks)
+
+
+@pytest.mark.parametrize(
+    ("make", "how", "expected"),
+    [
+        (make_plane, move_twice, True),
+        (make_space, move_twice, True),
+        (make_plane, partial(move_twice, at_s=31.0), False),  # while nobody looks
+        (make_space, partial(move_twice, at_s=21.0), False),
+        (make_plane, partial(move_twice, at_s=-1.0), False),
+        (make_plane, move_once, False),
+        (make_space, move_once, False),
+    ],
+)
+def test_what_is_elsewhere_than_in_a_map_and_moves_in_view_is_carried_about(
+    make: Any, how: Callable[[np.ndarray], np.ndarray], expected: bool
+) -> None:
+    """Where the map has it is one of its places. Unseen it may have moved before the drive, and once within it."""
+    given, result = make(), solve_in_map(make)
+    wrong = in_its_space(carry(given, how), Config().slam, dim=given.dim)
+    found = [one.landmark_id for one in find_carried(result, wrong, given.true_landmarks)]
+    assert found == ([NAME] if expected else [])
+    assert not find_carried(result, wrong)
+    elsewhere = replace(result, trajectory=replace(result.trajectory, frame="first_pose"))
+    assert not find_carried(elsewhere, wrong, given.true_landmarks)
+    others = given.true_landmarks[given.true_landmarks.landmark_id != NAME]
+    assert not find_carried(result, wrong, others)
+
+
+def test_what_moves_in_view_is_no_certain_move_of_a_map() -> None:
+    given = make_space()
+    result = run_slam(carry(given, move_twice), prior_map=given.true_landmarks)
+    assert list_codes(result) == [CARRIED]
+    assert not result.changes
+
+
+def test_the_place_of_a_map_is_the_first_whatever_is_seen_there() -> None:
+    at = np.repeat([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], [1, 4, 5], axis=0)
+    radius_m = np.full(10, 0.3)
+    for row, expected, elsewhere in ((0, [0.1, 0.5, 0.4], at[:, 0] == 1.0), (9, [0.5, 0.4, 0.1], at[:, 0] == 0.0)):
+        shares, found = _fill_places(at, radius_m, np.linalg.norm(at - at[row], axis=1) < radius_m)
+        assert shares == pytest.approx(expected)
+        np.testing.assert_array_equal(found, elsewhere)
+    shares, found = _fill_places(at, radius_m, np.zeros(10, dtype=np.bool_))  # never seen there
+    assert shares == pytest.approx([0.0, 0.5, 0.4, 0.1])
+    np.testing.assert_array_equal(found, at[:, 0] < 2.0)
+
+
+def test_looks_that_jump_are_no_move_in_view() -> None:
+    """As of identities that are misread for a look or two: what moves is at either place in a row."""
+    at, radius_m, taken_s = np.zeros((12, 2)), np.full(12, 0.3), 0.2 * np.arange(12.0)
+    assert not _moves_in_view(at, radius_m, taken_s)
+    for first, count, expected in ((5, 1, False), (5, 2, False), (6, 6, True), (9, 3, True), (10, 2, False)):
+        jumped = at.copy()
+        jumped[first : first + count] = 1.0
+        assert _moves_in_view(jumped, radius_m, taken_s) is expected
+        assert not _moves_in_view(0.2 * jumped, radius_m, taken_s)
+        slept_s = taken_s + np.where(np.arange(12) >= first, 5.0, 0.0)
+        assert not _moves_in_view(jumped, radius_m, slept_s)
 
 
 @pytest.mark.parametrize("size", [0.85, 1.3])

@@ -119,6 +119,10 @@ def test_another_size_of_all_tags_moves_none(kind: str, code: str, factor: float
     assert error_m(result, recording, in_map=True) < ORACLE * told + SMALL_M
 
 
+READ = ("frame", "landmark_id", "range_m")
+"""What is read of a radio."""
+
+
 def radios(world: World) -> Recording:
     """The drive with ranges alone."""
     recording = world.plane()
@@ -184,6 +188,26 @@ def test_a_radio_that_moved_has_no_bias(shift_m: tuple[float, float]) -> None:
     assert result.changes[0].probability > 0.9
 
 
+def test_a_radio_that_moves_in_the_middle_of_a_drive_is_where_its_ranges_are() -> None:
+    """Ranges from nearby are linear about where it is by then, not about where it was."""
+    world, at_s, name, shift_m = World(seed=5), 20.0, 2, (-0.5, 0.6)
+    before, after = radios(world), radios(replace(world, moved={name: shift_m}))
+    seen, since = before.detections, after.detections
+    stamp_s = before.frames.stamp_s
+    kept, new = ((stamp_s[one.frame] < at_s) == early for one, early in ((seen, True), (since, False)))
+    both = [np.concatenate([getattr(seen, key)[kept], getattr(since, key)[new]]) for key in READ]
+    rows = np.zeros(len(both[0]), dtype=np.int64)
+    moves = replace(before, detections=replace(seen[rows], **dict(zip(READ, both, strict=True))))
+    result = run_slam(moves, prior_map=world.map_in_plane())
+    (change,) = result.changes
+    assert change.landmark_ids == (name,)
+    assert change.displacement_m == pytest.approx(shift_m, abs=0.03)
+    assert change.stamp_from_s - 2.0 < at_s < change.stamp_to_s + 2.0
+    assert change.stamp_to_s - change.stamp_from_s < 5.0
+    assert change.probability > 0.99
+    assert result.causes == ()
+
+
 @pytest.mark.parametrize("mapped", [True, False])
 def test_first_values_of_a_bias_are_beside_that_of_all(mapped: bool) -> None:
     """With a map from where that has the radio; without one from where its ranges fit best."""
@@ -239,6 +263,18 @@ def test_from_one_side_a_radio_may_have_moved_or_have_a_bias(long_m: float) -> N
     assert result.verdict.kind is VerdictKind.WEAK
     assert cause.message in result.verdict.message
     assert cause.instead in result.verdict.message
+
+
+@pytest.mark.parametrize("seed", [5, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_right_radio_far_to_one_side_has_not_moved(seed: int) -> None:
+    """Its first bearing is a guess, metres off across the line of sight, where ranges are another line's."""
+    world, at_m = World(seed=seed), (96.0, 4.0)
+    survey = world.map_in_plane()
+    survey = Landmarks.at(np.append(survey.landmark_id, 99), np.append(survey.position_m, [at_m], axis=0))
+    result = run_slam(with_far_radio(world, at_m, 0.0), prior_map=survey)
+    assert result.changes == result.causes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind is VerdictKind.SOUND
 
 
 def test_ranges_of_all_that_are_too_long_are_no_bias_of_one() -> None:

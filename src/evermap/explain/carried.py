@@ -2,8 +2,9 @@
 
 One that moved once is at two places, and so is an identity that two landmarks carry. What is carried about is at many,
 from one look to the next hardly elsewhere. Its sightings say nothing of where the robot is: they bend the poses, or a
-map has it moved to where it happened to be last. Wrong identities are elsewhere for a look, and a landmark of another
-size than stated is at one place once it is as far as its size says.
+map has it moved to where it happened to be last. Where a map has it is one of its places, if it moves while it is in
+view: else it may have moved before the drive, and once within it. Wrong identities are elsewhere for a look, and a
+landmark of another size than stated is at one place once it is as far as its size says.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from evermap.explain.expectations import compare_detections, find_instants, find_poses_at, locate_detections
 from evermap.geometry import se2, se3
-from evermap.types import UNKNOWN, AnyRecording, BoolArray, Cause, FloatArray, IntArray, SlamResult
+from evermap.types import UNKNOWN, AnyRecording, BoolArray, Cause, FloatArray, IntArray, Landmarks, SlamResult
 
 CARRIED = "carried-about"
 """Code of the cause."""
@@ -27,6 +28,8 @@ AT_TWO, ELSEWHERE = 0.85, 5
 """Share of the sightings at the two places with most of them, at most, and how many are elsewhere, at least."""
 NEXT_S, JOINED = 1.0, 0.8
 """Time between sightings that follow each other, and the share of those elsewhere that must be near such a one."""
+IN_ROW = 3
+"""Sightings in a row at one place, and then at another, between which a landmark has moved in view."""
 WALKING_MPS = 1.0
 """How fast things are carried: from one look to the next they come so far."""
 SURELY = 3.0
@@ -45,12 +48,13 @@ class Carried(NamedTuple):
     apart_m: float
 
 
-def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, ...]:
+def find_carried(result: SlamResult, recording: AnyRecording, given: Landmarks | None = None) -> tuple[Carried, ...]:
     """Return landmarks on no stated body that are carried about, by where detections put them along a trajectory.
 
     Args:
         result: of the recording, or of one without some of its identities.
         recording: as it was read.
+        given: the map that the result was found in; None without.
     """
     compared = compare_detections(recording, result) if len(result.innovations) else None
     if compared is None or np.count_nonzero(compared.used) < FEWEST:
@@ -76,6 +80,10 @@ def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, 
 
         at, radius_m = put(1.0)
         shares, elsewhere = _fill_places(at, radius_m)
+        before_m = _find_given(result, given, identity, dim)
+        if before_m is not None and _moves_in_view(at, radius_m, taken_s[rows]):
+            at_first = np.linalg.norm(at - before_m, axis=1) < radius_m
+            shares, elsewhere = _fill_places(at, radius_m, at_first)
         if sum(shares[:2]) > AT_TWO or np.count_nonzero(elsewhere) < ELSEWHERE:
             continue
         if np.mean(_follow(at, radius_m, taken_s[rows])[elsewhere]) < JOINED:
@@ -87,12 +95,25 @@ def find_carried(result: SlamResult, recording: AnyRecording) -> tuple[Carried, 
     return tuple(found) if len(found) <= SHARE * len(often) else ()
 
 
-def _fill_places(at: FloatArray, radius_m: FloatArray) -> tuple[list[float], BoolArray]:
+def _find_given(result: SlamResult, given: Landmarks | None, identity: int, dim: int) -> FloatArray | None:
+    """Return (D,) where the map that a result is in has a landmark; None where it has not."""
+    if given is None or result.trajectory.frame != "prior_map":
+        return None
+    rows = np.flatnonzero(given.landmark_id == identity)
+    return given.position_m[rows[0], :dim] if len(rows) else None
+
+
+def _fill_places(
+    at: FloatArray, radius_m: FloatArray, at_first: BoolArray | None = None
+) -> tuple[list[float], BoolArray]:
     """Return shares of sightings (N, D) at places of radii (N,), the fullest first, each without those before it; and
-    which are at neither of the first two.
+    which are at neither of the first two. Before them all is the place of `at_first` (N,), if there is one.
     """
     near = np.linalg.norm(at[:, None] - at, axis=2) < radius_m[:, None]
     left, shares = np.ones(len(at), dtype=np.bool_), list[float]()
+    if at_first is not None:
+        left = ~at_first
+        shares.append(float(np.mean(at_first)))
     elsewhere = left
     while left.any():
         count = (near & left).sum(axis=1)
@@ -101,6 +122,21 @@ def _fill_places(at: FloatArray, radius_m: FloatArray) -> tuple[list[float], Boo
         left = left & ~near[fullest]
         elsewhere = left if len(shares) <= 2 else elsewhere
     return shares, elsewhere
+
+
+def _moves_in_view(at: FloatArray, radius_m: FloatArray, taken_s: FloatArray) -> bool:
+    """Return whether sightings (N, D), in order of time, are at one place in a row, and then, within a moment, in a row
+    at another.
+    """
+    for row in np.flatnonzero(np.diff(taken_s[IN_ROW - 1 : len(at) - IN_ROW + 1]) <= NEXT_S) + IN_ROW:
+        before, after = (np.median(some, axis=0) for some in (at[row - IN_ROW : row], at[row : row + IN_ROW]))
+        some = slice(row - IN_ROW, row + IN_ROW)
+        own = np.repeat([before, after], IN_ROW, axis=0)
+        other = np.repeat([after, before], IN_ROW, axis=0)
+        is_near = np.linalg.norm(at[some] - own, axis=1) < 0.5 * radius_m[some]
+        if is_near.all() and (np.linalg.norm(at[some] - other, axis=1) > radius_m[some]).all():
+            return True
+    return False
 
 
 def _follow(at: FloatArray, radius_m: FloatArray, taken_s: FloatArray) -> BoolArray:

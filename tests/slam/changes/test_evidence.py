@@ -16,6 +16,7 @@ from evermap.estimate.sparse.system import exhausted
 from evermap.slam.calibration import AHEAD, ASIDE, FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.problem import Estimate, Problem, independent
+from evermap.types import ANY_BEARING_RAD
 
 KNOWN_SIZE = default_prior(range_slope=0.0)
 """With the range slope given, lengths are what the sensor says: nothing to divide."""
@@ -68,6 +69,39 @@ def test_evidence_is_the_schur_complement(bounds: list[int], seed: int) -> None:
     # the borders of windows are held to a kilometre, nothing else may differ
     np.testing.assert_allclose(evidence.information, information, atol=2e-5 * np.abs(information).max())
     np.testing.assert_allclose(evidence.pull, pull, atol=2e-5 * np.abs(pull).max() + 1e-3)
+
+
+def test_ranges_alone_are_linear_where_the_estimate_is_whatever_the_first_bearing() -> None:
+    """The one bearing of a landmark that is seen by ranges is a guess, which may be far across the line of sight."""
+    world = make_world(4, n_poses=24, n_landmarks=5, prior=KNOWN_SIZE, p_seen=1.0, turn_radps=0.2)
+    problem, guess = world.problem, 0.4
+    sigma, reading = np.full((len(problem.reading), 2), np.nan), problem.reading.copy()
+    sigma[:, 1] = ANY_BEARING_RAD
+    first = np.unique(problem.landmark_row, return_index=True)[1]
+    sigma[first, 1] = 0.1
+    reading[:, 1] += guess
+    ranged = replace(world, problem=replace(problem, reading=reading, sigma_given=sigma))
+    evidence = evidence_of(ranged, [0, 8, 16, 24])
+    np.testing.assert_allclose(evidence.position, world.truth.landmark[evidence.landmark], atol=1e-12)
+    sigma[first + 5, 1] = 0.1  # with more of them it is where they say, by the poses of its window
+    evidence = evidence_of(replace(ranged, problem=replace(ranged.problem, sigma_given=sigma)), [0, 8, 16, 24])
+    off_m = np.linalg.norm(evidence.position - world.truth.landmark[evidence.landmark], axis=1)
+    assert (off_m[evidence.window == 0] > 0.1).all()
+    assert (off_m[evidence.window > 0] < 1e-12).all()
+
+
+def test_ranges_of_what_moved_are_linear_where_it_is_by_then() -> None:
+    world = make_world(4, n_poses=24, n_landmarks=5, p_seen=1.0, turn_radps=0.2)
+    sigma = np.full((len(world.problem.reading), 2), np.nan)
+    sigma[:, 1] = ANY_BEARING_RAD
+    problem, bounds = replace(world.problem, sigma_given=sigma), np.array([0, 8, 16, 24])
+    moved = replace(world.truth, landmark=np.vstack([world.truth.landmark, world.truth.landmark[2] + [0.7, -0.4]]))
+    row = np.array([[0, 1, 2, 3, 4], [0, 1, 5, 3, 4], [0, 1, 5, 3, 4]])
+    evidence = exhausted(landmark_evidence(problem, moved, world.noise, problem.prior, bounds, 3, row=row))
+    at = evidence.position - evidence.position[0]
+    expected = moved.landmark[row[evidence.window, evidence.landmark]]
+    scale = np.linalg.norm(at[1]) / np.linalg.norm(expected[1] - expected[0])  # of all by the prior of the metre
+    np.testing.assert_allclose(at, scale * (expected - expected[0]), atol=1e-9)
 
 
 def test_windows_with_tied_copies_are_one_window() -> None:

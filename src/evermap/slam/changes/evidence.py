@@ -139,6 +139,7 @@ def landmark_evidence(
     fewest: int,
     *,
     sized: bool = True,
+    row: IntArray | None = None,
 ) -> Slices[WindowEvidence]:
     """Eliminate poses and calibration of a linearised problem, window by window, in slices.
 
@@ -146,14 +147,16 @@ def landmark_evidence(
     estimate, and `prior` is of the calibration as the user means it. Windows begin at the poses `bounds` (W + 1,), of
     which the last is the number of poses. A copy takes the `fewest` sightings at least: one or two may be wrong
     identities. If `sized`, range slope and size are divided by their priors; else positions stay in the metres of the
-    sensor, which is enough where there is no map to compare with.
+    sensor, which is enough where there is no map to compare with. If some have moved, `row` (W, L) are the places of
+    the estimate at which landmarks are in each window.
     """
-    estimate = in_sensor_metres(estimate, prior)
     held = prior.without_scale()
     n_windows = len(bounds) - 1
+    estimate = in_sensor_metres(estimate, prior)
     pieces: list[_Piece] = []
     for w in range(n_windows):
-        piece = yield from _piece(problem, estimate, noise, held, (bounds[w], bounds[w + 1], fewest))
+        here = estimate if row is None else replace(estimate, landmark=estimate.landmark[row[w]])
+        piece = yield from _piece(problem, here, noise, held, (bounds[w], bounds[w + 1], fewest))
         pieces.append(piece)
     information, right, at_pose = _joined(pieces)
     yield dense_ms(len(right))
@@ -287,8 +290,9 @@ def _piece(
     )
     sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
     position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
-    ranged = np.bincount(part.landmark_row, part.has_bearing, minlength=count) == 0
-    position[ranged] = estimate.landmark[landmark[ranged]]  # ranges alone are linear near where it is only
+    # ranges alone are linear near where it is only; one bearing of a landmark is a first value (`slam.ranges`)
+    ranged = np.bincount(part.landmark_row, part.has_bearing, minlength=count) <= 1
+    position[ranged] = estimate.landmark[landmark[ranged]]
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
     yield MS_OF_DETECTION * len(used)

@@ -142,9 +142,9 @@ class Joint(Method):
             return Explanation(problem, estimate, self._current())
         for _ in range(ROUNDS if final else 1):
             bounds = self._bounds(base)
-            first = self._first_places(estimate)
+            row = self._rows_by_window(estimate, base.stamp_s[bounds[:-1]])
             evidence = yield from landmark_evidence(
-                base, first, noise, self._calibration, bounds, self._fewest, sized=in_map
+                base, estimate, noise, self._calibration, bounds, self._fewest, sized=in_map, row=row
             )
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
@@ -191,6 +191,19 @@ class Joint(Method):
     def _first_places(self, estimate: Estimate) -> Estimate:
         """Return one place per landmark: the first."""
         return replace(estimate, landmark=estimate.landmark[: self._count])
+
+    def _rows_by_window(self, estimate: Estimate, start_s: FloatArray) -> IntArray:
+        """Return (W, L) places of landmarks in every window, by where it starts (W,) [s]: of what moved the later one.
+
+        Evidence of ranges is linear only near where a landmark is by then.
+        """
+        row = np.tile(np.arange(self._count), (len(start_s), 1))
+        if len(estimate.landmark) == len(self._landmark):
+            current = self._current()
+            for group in self._groups:
+                if group.since_s is not None:
+                    row[np.ix_(start_s >= group.since_s, group.members)] = current[group.members]
+        return row
 
     def _explained(
         self, base: Problem, estimate: Estimate, evidence: WindowEvidence, believed: GivenMap, groups: Groups
