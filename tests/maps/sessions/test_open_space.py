@@ -52,19 +52,21 @@ def test_the_length_of_a_line_on_which_no_ray_passed(rays: list[tuple[float, ...
     assert unseen((0.0, 0.0), (10.0, 0.0), rays) == pytest.approx(wanted, abs=2.5 * STEP_M)
 
 
-def weigh(teachers: list[tuple[float, bool]], u: float = 2.0, p_gone: float = 0.05) -> OpenSpace:
+def weigh(
+    teachers: list[tuple[float, bool]], u: float = 2.0, p_gone: float = 0.05, of: list[int] | None = None
+) -> OpenSpace:
     """What is said of 0, missed along a line of which `u` metres were not seen through, by others that were seen along
-    lines with some metres, or missed along these though they stand.
+    lines with some metres, or missed along these though they stand; `of` are their names if they have several lines.
     """
     frames, rest = 4, [(u, False), *teachers]
     n = len(rest)
-    row = np.repeat(np.arange(n), frames)
+    row, name = np.repeat(np.arange(n), frames), np.array([0, *(of or range(1, n))])
     eye, length = np.column_stack([np.zeros(n), 100.0 * np.arange(n)]), 10.0
     place = eye + [length, 0.0]
     hit = np.array([seen for _, seen in rest])[row]
     covered = np.array([length - metres for metres, _ in rest])
     rays = Rays(eye, eye + np.column_stack([covered, np.zeros(n)]), np.full(n, n))
-    looks = NewLooks(row, row, hit, np.full(len(row), 0.98), eye[row], place[row])
+    looks = NewLooks(name[row], row, hit, np.full(len(row), 0.98), eye[row], place[row])
     gone = np.full(n, 1e-3)
     gone[0] = p_gone
     teaches = np.ones(n, dtype=np.bool_)
@@ -106,6 +108,18 @@ def test_what_stands_and_is_missed_shows_walls() -> None:
     assert 1.0 - (1.0 - hidden) * np.exp(-2.0 * rate) == pytest.approx(5.0 / 18.0, abs=0.05)  # five of eighteen
 
 
+def test_lines_along_which_is_missed_what_is_seen_along_others_show_walls() -> None:
+    """Each of some is seen along one of two lines, whichever way; half of the lines are closed."""
+    names = [*range(1, 13), *range(1, 13)]
+    both, one = (weigh([(4.0, True)] * 12 + [(4.0, seen)] * 12, of=names) for seen in (True, False))
+    assert both.p_clear[0] > 0.95
+    assert one.p_clear[0] < 0.8
+    # of each the mean of its lines counts, as one: half a wall in two metres, but for the prior
+    metres = METRES + 12 * 2.0
+    rate = one.learned[0] / one.learned[1]
+    assert rate == pytest.approx((WALLS + 6.0) / (metres + 6.0 * 2.0), rel=0.25)
+
+
 def test_what_is_missed_does_not_close_its_own_line() -> None:
     """Its own miss is the evidence on it: it counts once, whatever its prior."""
     shown = [(4.0, True)] * 12
@@ -124,10 +138,9 @@ def test_what_a_session_learned_is_worth_so_much_to_the_next() -> None:
 SENSOR = Sensor(range_max_m=40.0, bearing_min_rad=-1.0, bearing_max_rad=1.0, p_detect=0.9)
 
 
-def a_row(seen: tuple[int, ...], wall_m: float = np.inf) -> tuple[LivingMap, PlaceLooks]:
-    """Things on both sides of a way, known from one side, and passed from the other: some are seen.
-
-    Beyond `wall_m` from the way nothing is ever seen, from where the session looks.
+def a_row(seen: tuple[int, ...], p_here: float = 0.95, *, forth: bool = False) -> tuple[LivingMap, PlaceLooks]:
+    """Things on both sides of a way, known from one side, and passed from the other: some are seen. Before that the
+    session may see all of them from where they are known.
     """
     place_m = {k: (6.0 * (k // 2), 4.0 if k % 2 else -4.0) for k in range(20)}
     living = begun(found([*place_m], [*place_m.values()]), LivingConfig(cliques=False)).living
@@ -137,14 +150,25 @@ def a_row(seen: tuple[int, ...], wall_m: float = np.inf) -> tuple[LivingMap, Pla
     lines = SightLines.empty()
     cell = lines.cells(eye, living.places.position_m[place])
     lines = lines.learned(names, place, cell, np.ones(100, dtype=np.bool_), np.ones(100))
-    living = replace(living, sightlines=lines, sites=replace(living.sites, p_here=np.full(20, 0.95)), stamp_s=100.0)
+    sites = replace(living.sites, p_here=np.full(20, p_here))
+    living = replace(living, sightlines=lines, sites=sites, stamp_s=100.0)
     path = np.column_stack([np.linspace(75.0, -10.0, 170), np.zeros(170), np.full(170, np.pi)])
-    listed = Watch.of(Sighting(1000.0 + np.arange(170.0), path, *np.zeros((2, 0), dtype=np.int64)),
-                      living.places.position_m, SENSOR).listed  # fmt: skip
-    hit = np.isin(living.places.landmark_id[listed.landmark], seen)
-    hit &= np.abs(living.places.position_m[listed.landmark, 1]) < wall_m
-    watch = Watch(1000.0 + np.arange(170.0), listed._replace(hit=hit), path)
-    return living, looked_at(living, living.sites.p_here, watch, CONFIG)
+    if forth:
+        path = np.vstack([path[::-1] * [1.0, 1.0, 0.0], path])
+    stamp_s = 1000.0 + np.arange(float(len(path)))
+    nothing = np.zeros((2, 0), dtype=np.int64)
+    listed = Watch.of(Sighting(stamp_s, path, *nothing), living.places.position_m, SENSOR).listed
+    x_m = path[listed.pose, 0] - living.places.position_m[listed.landmark, 0]
+    known = (np.abs(x_m + 8.0) < 0.3) & (path[listed.pose, 2] == 0.0)
+    hit = np.isin(living.places.landmark_id[listed.landmark], seen) | known
+    return living, looked_at(living, living.sites.p_here, Watch(stamp_s, listed._replace(hit=hit), path), CONFIG)
+
+
+def test_what_the_session_saw_is_not_gone_whatever_was_believed_before() -> None:
+    """Seen from one side and missed from the other: there is a wall, as probably for what was doubtful."""
+    one, other = (a_row(tuple(range(0, 20, 2)), p_here, forth=True)[1].open_space for p_here in (0.95, 0.55))
+    assert one[0] / one[1] > 0.01
+    np.testing.assert_allclose(other, one, rtol=1e-9)
 
 
 def test_a_miss_counts_along_new_lines_where_all_others_are_seen() -> None:
