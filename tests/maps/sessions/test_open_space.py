@@ -82,7 +82,7 @@ def test_lines_on_which_others_are_seen_open_a_line(shown: int, u: float) -> Non
     """
     each = 4.0
     found_ = weigh([(each, True)] * shown, u)
-    metres = METRES + shown * each
+    metres, u = METRES + shown * each, max(u, CONFIG.looks.beside_m)
     no_wall = (metres / (metres + u)) ** WALLS
     not_hidden = 1.0 - HIDDEN / (HIDDEN + SHOWN + shown)
     assert found_.unseen_m[0] == pytest.approx(u, abs=2.0 * STEP_M)
@@ -92,8 +92,8 @@ def test_lines_on_which_others_are_seen_open_a_line(shown: int, u: float) -> Non
 
 
 def test_without_others_no_line_of_any_length_is_open() -> None:
-    assert weigh([], 0.5).p_clear[0] < 0.5
-    assert not weigh([], 0.5).counts.any()
+    assert weigh([], 0.0).p_clear[0] < 0.5
+    assert not weigh([], 0.0).counts.any()
 
 
 def test_what_stands_and_is_missed_shows_walls() -> None:

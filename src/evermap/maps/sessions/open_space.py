@@ -113,9 +113,10 @@ def weigh_new_lines(
     u = np.full(len(first), np.inf)
     columns = looks.eye_m[first[asked]], looks.place_m[first[asked]], of[asked], *rays
     u[asked] = unseen_length(*(np.ascontiguousarray(one) for one in columns), (WIDE_M, NARROW_M, STEP_M))
+    u = np.maximum(u, settings.beside_m)  # things are put against walls: of those next to a place rays say little
     unseen_m = _least(u, of, often, n, settings.witnesses)
     who = np.flatnonzero(np.isfinite(unseen_m))
-    alike = u[key] <= 2.0 * unseen_m[looks.clique] + settings.near_m
+    alike = u[key] <= 2.0 * unseen_m[looks.clique] + STEP_M
     away = looks.eye_m - looks.place_m
     sides, of_shown, of_all = (
         count_sides(looks.clique[some], away[some], n, settings)[who, None, None]
