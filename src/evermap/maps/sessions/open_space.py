@@ -111,8 +111,12 @@ def weigh_new_lines(
     key, of = key.ravel(), looks.clique[first]
     asked = np.flatnonzero(_evenly(of, n, MOST_LINES))
     u = np.full(len(first), np.inf)
-    columns = looks.eye_m[first[asked]], looks.place_m[first[asked]], of[asked], *rays
-    u[asked] = unseen_length(*(np.ascontiguousarray(one) for one in columns), (WIDE_M, NARROW_M, STEP_M))
+    eye, place, ray_eye, ray_end = (
+        np.ascontiguousarray(one, dtype=np.float64)
+        for one in (looks.eye_m[first[asked]], looks.place_m[first[asked]], rays.from_m, rays.to_m)
+    )
+    limits = WIDE_M, NARROW_M, STEP_M
+    u[asked] = unseen_length(eye, place, of[asked], ray_eye, ray_end, rays.clique, limits)
     u = np.maximum(u, settings.beside_m)  # things are put against walls: of those next to a place rays say little
     unseen_m = _least(u, of, often, n, settings.witnesses)
     who = np.flatnonzero(np.isfinite(unseen_m))
