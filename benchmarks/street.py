@@ -8,6 +8,8 @@ tells it late.
 
     python -m benchmarks.street                        # 20 seeds, with 0, 2, 4 and 6 vans that leave; an hour
     python -m benchmarks.street --seeds 5 --leaving 4  # some
+    python -m benchmarks.street --later back           # each later day driven the other way
+    python -m benchmarks.street --later lane           # or in the other lane
     python -m benchmarks.street --set living.learn_lifetimes=false
 """
 
@@ -16,6 +18,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +36,16 @@ FIRST_S, EVERY_S, AHEAD_M = 9.0, 4.5, 24.0
 EVER_S = 1e6
 GOES, COMES = "left", "came"
 KINDS = {ChangeKind.VANISHED: GOES, ChangeKind.APPEARED: COMES, ChangeKind.RETURNED: COMES}
+
+
+class Way(NamedTuple):
+    """How later days are driven: the other way, and how far left of the first day's lane."""
+
+    back: bool = False
+    aside_m: float = 0.0
+
+
+WAYS = {"same": Way(), "back": Way(back=True), "lane": Way(aside_m=3.0), "both": Way(back=True, aside_m=3.0)}
 
 
 def park_for_days(seed: int, n_leaving: int) -> Parking:
@@ -61,16 +74,20 @@ def park_for_days(seed: int, n_leaving: int) -> Parking:
     return street
 
 
-def score_street(seed: int, n_leaving: int, config: Config) -> Counter[str]:
+def score_street(seed: int, n_leaving: int, config: Config, later: Way = WAYS["same"]) -> Counter[str]:
     """Return the numbers of statements, of right ones, and of changes, over the later days.
 
-    `lost` where a day is; `kept` is what left in view and is in the map.
+    `lost` where a day is; `kept` is what left in view and is in the map; `departed` cars and vans left, of which
+    `reported` are told, and `left_percent` is the sum of what the map believes of their presence afterwards;
+    `stay_percent` the map's probability that a car stays for a day, at the end.
     """
     street, living, found = park_for_days(seed, n_leaving), None, Counter[str]()
     slots: dict[int, int] = {}
     owed: set[tuple[int, str]] = set()
     for day in range(DAYS):
-        session = run_session(street.drive(100 * seed + day, day * DAY_S), living, config)
+        way = later if day else WAYS["same"]
+        recording = street.drive(100 * seed + day, day * DAY_S, back=way.back, aside_m=way.aside_m)
+        session = run_session(recording, living, config)
         living = session.living
         if day and not session.found:
             found["lost"] += 1
@@ -84,7 +101,7 @@ def score_street(seed: int, n_leaving: int, config: Config) -> Counter[str]:
             continue
         before, now = (street.standing(DAY_S * at + 60.0) for at in (day - 1, day))
         true = {(slot, GOES) for slot in before - now} | {(slot, COMES) for slot in now - before}
-        true = {(slot, what) for slot, what in true if slot in street.find_passed()}
+        true = {(slot, what) for slot, what in true if slot in street.find_passed(back=way.back)}
         told = [
             (slots[change.landmark_ids[0]], KINDS.get(change.kind, change.kind.value))
             for change in session.changes
@@ -96,7 +113,15 @@ def score_street(seed: int, n_leaving: int, config: Config) -> Counter[str]:
         found.update(told=len(told), right=sum(one in true | late for one in told), true=len(true))
         found.update(found=len(true & set(told)), late=len(late & set(told)))
         owed = (true | late) - set(told)
+        departed = {slot for slot, what in true if what == GOES}
+        found.update(departed=len(departed), reported=sum((slot, GOES) in told for slot in departed))
+        for slot in departed:
+            mine = [slots.get(name) == slot for name in known.landmark_id.tolist()]
+            found["left_percent"] += round(100.0 * known.p_exists[mine].max(initial=0.0))
         found.update(f"false {one[1]}" for one in told if one not in true | late)
+    assert living is not None
+    stay = living.lives.of(0, np.zeros(3)).stay
+    found["streets"], found["stay_percent"] = 1, round(100.0 * float(np.exp(stay.log_survival(np.array([DAY_S]))[0])))
     return found
 
 
@@ -106,13 +131,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--leaving", type=int, nargs="+", default=[0, 2, 4, 6])
+    parser.add_argument("--later", choices=WAYS, default="same", help="how later days are driven")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     chosen = parser.parse_args(arguments)
     config, total = with_overrides(Config(), ["living.accept=any", *chosen.overrides]), Counter[str]()
     for n_leaving in chosen.leaving:
         of_number = Counter[str]()
         for seed in range(chosen.first, chosen.first + chosen.seeds):
-            of_number.update(score_street(seed, n_leaving, config))
+            of_number.update(score_street(seed, n_leaving, config, WAYS[chosen.later]))
         total.update(of_number)
         _print_row(f"{n_leaving} leave", of_number)
     _print_row("all", total)
@@ -121,7 +147,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _print_row(name: str, of: Counter[str]) -> None:
     false = of["told"] - of["right"]
     print(
-        f"{name}: {false} of {of['told']} statements false, {of['found']} of {of['true']} changes found",
+        f"{name}: {false} of {of['told']} statements false, {of['found']} of {of['true']} changes found;",
+        f"{of['reported']} of {of['departed']} departures, believed there by {of['left_percent']} % in sum;",
+        f"a car stays for a day with {of['stay_percent'] / max(of['streets'], 1):.1f} %",
         {key: count for key, count in of.items() if key.startswith(("false", "kept", "late", "lost"))},
         flush=True,
     )

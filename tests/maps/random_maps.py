@@ -148,7 +148,12 @@ def random_lines(random: np.random.Generator, places: Places) -> SightLines:
     lines = SightLines.empty().learned(
         (places.site_id, places.landmark_id), place, cell, hit, random.random(len(place)) + 0.1
     )
-    return replace(lines, hidden=random.uniform(0, 9, 3), shown=random.uniform(0, 99, 3))
+    return replace(
+        lines,
+        hidden=random.uniform(0, 9, 3),
+        shown=random.uniform(0, 99, 3),
+        open_space=random.uniform(0.1, 9.0, 4),
+    )
 
 
 def random_evidence(seed: int, living: LivingMap, *, looks: int = 40) -> Evidence:

@@ -390,6 +390,7 @@ def test_lines_of_sight_and_views_read_back() -> None:
     assert len(living.sightlines) > 10
     assert len(living.views) == 30
     assert living.sightlines.hidden.min() > 0.0
+    assert living.sightlines.open_space.min() > 0.0
     seen = []
     assert_same(rewritten(living, lambda manifest: seen.append(manifest["format"])), living)
     assert seen == [2]
@@ -403,6 +404,8 @@ def test_lines_of_sight_and_views_read_back() -> None:
         ("stays", {"p_gone": np.nan}, "'stays.p_gone' is not a probability"),
         ("sightlines", {"hits": -1.0}, "a negative count"),
         ("sightlines", {"shown": np.inf}, "'sightlines.shown' is not finite"),
+        ("sightlines", {"open_space": np.nan}, "'sightlines.open_space' is not finite"),
+        ("sightlines", {"open_space": -1.0}, "a negative count"),
         ("views", {"frames": -3.0}, "a negative count"),
         ("views", {"stamp_s": np.nan}, "'views.stamp_s' is not finite"),
         ("views", {"cell_m": 0.0}, "a cell without size"),
@@ -455,7 +458,20 @@ def test_what_maps_in_space_brought_is_checked(
     assert "a covariance of shape" in content.flaw(replace(SPATIAL, covariance_m2=np.eye(size // 3 * 2)))
 
 
-@pytest.mark.parametrize("column", ["sightlines.cell", "views.heading", "stays.p_gone", "sightlines.hidden"])
+def test_a_map_that_learned_nothing_of_new_lines_has_no_column_of_it() -> None:
+    """So an older evermap reads it, and what such a one wrote has learned nothing."""
+    living = random_map(5)
+    living = replace(living, sightlines=replace(living.sightlines, open_space=np.zeros(0)))
+    seen: list[str] = []
+    read = rewritten(living, lambda manifest: seen.extend(manifest["columns"]))
+    assert "sightlines.hidden" in seen
+    assert not [name for name in seen if name.endswith("open_space")]
+    assert len(read.sightlines.open_space) == 0
+
+
+@pytest.mark.parametrize(
+    "column", ["sightlines.cell", "views.heading", "stays.p_gone", "sightlines.hidden", "sightlines.open_space"]
+)
 def test_columns_of_other_lengths_are_a_flaw(column: str) -> None:
     living = random_map(6)
     part, name = column.split(".")

@@ -151,6 +151,8 @@ class LooksConfig(Section):
     most_sides: Count = rule(3, "sectors from which a place counts as seen from all sides")
     together_m: NotNegative = rule(2.0, "cliques missed from places this close may be hidden by one object [m]")
     near_m: NotNegative = rule(0.6, "a place is visible from positions this close to one from which it was seen [m]")
+    most_unseen_m: Positive = rule(100.0, "metres that earlier sessions are worth in what is said of new lines [m]")
+    most_new: Positive = rule(30.0, "cliques that they are worth in it")
     least_expected: Positive = rule(2.0, "minimum expected detections of earlier looks")
     sure: Share = rule(
         0.9, "probability from which something new is told to have come after a look, not an earlier one"
@@ -245,6 +247,10 @@ class SightConfig(Section):
     p_hidden_beside: Share = rule(0.03, "the same if another landmark is seen along them now")
     p_hidden_unknown: Share = rule(
         0.2, "the same if they were unknown, but a landmark close to them and behind is seen"
+    )
+    open_space: tuple[Positive, Positive, Positive, Positive] = rule(
+        (0.5, 0.05, 0.2, 0.8),
+        "what is believed of new lines at first: half a wall in 5 cm, and of one place a fifth hidden",
     )
     hidden_looks: Positive = rule(5.0, "pseudo-sessions of these probabilities")
     most_sessions: Positive = rule(2000.0, "sessions of cliques after which old ones fade")

@@ -386,6 +386,56 @@ def witnessed(
     return beside, along
 
 
+@kernel
+def unseen_length(
+    eye: FloatArray, place: FloatArray, body: Any, ray_eye: FloatArray, ray_end: FloatArray, ray_body: Any,
+    limits: tuple[float, float, float],
+) -> FloatArray:  # fmt: skip
+    """Return (K,) lengths of lines, from eyes (K, 2) to places (K, 2), on which no ray passed [m].
+
+    A ray is as wide as the eyes are uncertain where it begins, and comes to a point where it ends: space along a wall
+    is not seen through to what is behind it. A line is not asked by the rays to what it leads to itself.
+
+    Args:
+        eye: (K, 2) where the lines begin [m].
+        place: (K, 2) where they end [m].
+        body: (K,) what each leads to.
+        ray_eye: (R, 2) where the rays begin along which something was seen [m].
+        ray_end: (R, 2) where they end [m].
+        ray_body: (R,) what was seen.
+        limits: half widths where a ray begins and ends [m], and the step along a line [m].
+    """
+    wide_m, narrow_m, step_m = limits
+    length, far, near = np.zeros(len(eye)), np.empty(len(ray_eye)), np.empty(len(ray_eye), np.int64)
+    for r in range(len(ray_eye)):
+        far[r] = math.hypot(ray_end[r, 0] - ray_eye[r, 0], ray_end[r, 1] - ray_eye[r, 1])
+    for k in range(len(eye)):
+        whole = math.hypot(place[k, 0] - eye[k, 0], place[k, 1] - eye[k, 1])
+        x, y, count = 0.5 * (eye[k, 0] + place[k, 0]), 0.5 * (eye[k, 1] + place[k, 1]), 0
+        for r in range(len(ray_eye)):  # those that may come near
+            between = math.hypot(x - 0.5 * (ray_eye[r, 0] + ray_end[r, 0]), y - 0.5 * (ray_eye[r, 1] + ray_end[r, 1]))
+            if ray_body[r] != body[k] and far[r] > 0.0 and between <= 0.5 * (whole + far[r]) + wide_m:
+                near[count] = r
+                count += 1
+        steps, last = max(1, math.ceil(whole / step_m)), 0
+        for i in range(steps):
+            part, passed = (i + 0.5) / steps, False
+            x, y = eye[k, 0] + part * (place[k, 0] - eye[k, 0]), eye[k, 1] + part * (place[k, 1] - eye[k, 1])
+            for n in range(count):  # from the one that passed before: it mostly does again
+                r = near[(last + n) % count]
+                ux, uy = (ray_end[r, 0] - ray_eye[r, 0]) / far[r], (ray_end[r, 1] - ray_eye[r, 1]) / far[r]
+                dx, dy = x - ray_eye[r, 0], y - ray_eye[r, 1]
+                along = dx * ux + dy * uy
+                if along < 0.0 or along > far[r]:
+                    continue
+                if abs(dx * uy - dy * ux) <= narrow_m + (wide_m - narrow_m) * (1.0 - along / far[r]):
+                    passed, last = True, (last + n) % count
+                    break
+            if not passed:
+                length[k] += whole / steps
+    return length
+
+
 @exact
 def within_reach(pose: Any, landmark: Any, eye: FloatArray, position: FloatArray, reach_m: float) -> BoolArray:
     """Return (N,) looks from poses at landmarks that are nearer along both axes."""

@@ -80,6 +80,8 @@ class SightLines:
             were; by what was known of the lines, see `SightConfig.p_hidden`.
         cell_m: side of a cell.
         rules: what is believed of lines of sight, and how it is learned.
+        open_space: (4,) what sessions learned of lines that were new: walls, as shape and rate [m] of their number a
+            metre, and the share of places that are hidden all the same, by both parameters; empty before the first.
     """
 
     site_id: IntArray
@@ -91,6 +93,7 @@ class SightLines:
     shown: FloatArray = field(default_factory=lambda: np.zeros(3))
     cell_m: float = 0.5
     rules: SightConfig = USUAL
+    open_space: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -204,7 +207,14 @@ class SightLines:
         scale = self.rules.most_looks / np.maximum(looks, self.rules.most_looks)
         at = every // _SPAN
         rows = places[0][at], places[1][at], every % _SPAN
-        return SightLines(*rows, hits * scale, looks * scale, self.hidden, self.shown, self.cell_m, self.rules)
+        return replace(
+            self,
+            site_id=rows[0],
+            landmark_id=rows[1],
+            cell=rows[2],
+            hits=hits * scale,
+            looks=looks * scale,
+        )
 
     def _around(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray

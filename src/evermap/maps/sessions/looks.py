@@ -1,6 +1,8 @@
 """Looks of a session, and their evidence on new landmarks.
 
-A hit is a look anywhere. A miss is a look only along a line of sight that is known to be clear.
+A hit is a look anywhere. A miss is a look only along a line of sight that is known to be clear: something was seen
+along it before, something behind it is seen now, or it leads through space that the session saw to be open
+(`open_space`).
 
 A landmark that the map did not know has appeared if its place was seen empty: earlier sessions looked at it from where
 it is seen now, or past it at something behind. With `t` the time since one of them and `S` the survival of its class in
@@ -28,6 +30,7 @@ from evermap.existence.sites import SiteLooks
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
 from evermap.maps.sessions.extend import first_and_last
+from evermap.maps.sessions.open_space import NewLooks, OpenSpace, Rays, count_sides, weigh_new_lines
 from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets, session_rate
 from evermap.sensing.visibility import LooksAt, NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
@@ -39,14 +42,14 @@ LOGITS = np.linspace(-60.0, 20.0, 801)
 FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
 positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
+LEAST_GONE = 1e-3
+"""Probability that something is gone which the session saw."""
 SHARES = np.geomspace(0.25, 64.0, 25)
 """Parameters of the beta distribution of that share which are weighed, all alike (both are a number of positions)."""
 USUAL_RANGE = 0.9
 """Share of the detections within whose range a miss says something: data sheets promise more."""
 EXPECTED = 1.5
 """Detections that one position must lead to expect, or its misses are chance."""
-_STARTS = 12
-"""Directions of a sector in which sectors may begin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +111,7 @@ class PlaceLooks:
         rate: how often the session detects, over what lines of sight lead to expect.
         p_hidden: (3,) probability that a place is hidden for a session, as `SightLines.p_hidden`, by earlier ones and
             all that this one looked at.
+        open_space: (4,) as `SightLines.open_space`, after the session; or empty.
     """
 
     rows: SiteLooks
@@ -121,6 +125,7 @@ class PlaceLooks:
     share: FloatArray
     rate: float = 1.0
     p_hidden: FloatArray = field(default_factory=lambda: np.array(SightConfig().p_hidden))
+    open_space: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: LivingConfig) -> PlaceLooks:
@@ -170,18 +175,22 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
     was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
     unwitnessed = _unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
-    counts, sight, p_hidden, share, of_kind = _hidden(
+    was_new = (~was_clear & (p_before > rules.blocked))[key]
+    is_new = was_new & (~line_is_clear & (p_clear > rules.blocked))[key]
+    counts, sight, p_hidden, share, of_kind, space = _hidden(
         living,
         p_start,
         rows,
         clear,
         beside & clear,
         unknown,
+        (was_new, is_new),
         lambda some: (eye[frame[some], :2], floor_m[place[some]]),
+        nominal,
         settings,
     )
     lines = lines.at(rate, rules.highest_rate)._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
-    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, share, rate, of_kind)
+    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed, share, rate, of_kind, space)
 
 
 def _rate(rows: SiteLooks, p_detect: FloatArray, known: BoolArray, n_sites: int, rules: SightConfig) -> float:
@@ -226,11 +235,13 @@ def _hidden(
     clear: BoolArray,
     beside: BoolArray,
     unknown: BoolArray,
+    new: tuple[BoolArray, BoolArray],
     ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
+    nominal: FloatArray,
     settings: LooksConfig,
-) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return looks that count, the (C,) state of the lines to each clique, its (C,) probability of being hidden, what
-    (C,) each counts among those that were looked at from the same place, and `PlaceLooks.p_hidden`.
+    (C,) each counts among those that were looked at from the same place, `PlaceLooks.p_hidden` and `open_space`.
 
     By masks (N,) of looks along clear lines, of those with a sighting nearby or behind, and of unknown lines.
 
@@ -247,45 +258,74 @@ def _hidden(
     known = np.bincount(row, p_start, minlength=n) >= 0.5
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
-    looks = np.flatnonzero(clear)
+    unlooked = (n_clear < least) & (sight != 1)
+    space = _through_space(living, p_start, rows, new, unlooked, p_gone, nominal, ends, settings)
+    through = space.p_clear >= living.sightlines.rules.clear
+    counts |= space.counts
+    looks = np.flatnonzero(clear | space.counts)
     clique, eye = rows.clique[looks], ends(looks)[0]
     total = np.column_stack([np.bincount(clique, eye[:, k], minlength=n) for k in (0, 1)])
-    middle = total / np.where(n_clear > 0, n_clear, np.nan)[:, None]  # of none near nothing
+    n_looks = np.bincount(clique, minlength=n)
+    middle = total / np.where(n_looks > 0, n_looks, np.nan)[:, None]  # of none near nothing
     looked = known & (n_clear >= least)
     near = np.linalg.norm(middle[:, None] - middle, axis=2) < settings.together_m
     # with a witness in each line no one door hides several
     share = np.where(sight == 0, 1.0 / np.maximum((near & looked & (sight == 0)).sum(axis=1), 1), 1.0)
-    alone = (hits == 0) & (sight == 0) & (n_clear > 0)
+    alone = (hits == 0) & (sight == 0) & (n_looks > 0)
     near &= alone[:, None] & alone
     np.fill_diagonal(near, True)
     of_clique, of_kind = _p_hidden(living.sightlines, sight, looked, hits > 0, p_gone, share, near)
     missed = np.flatnonzero(counts & ~rows.hit)
     eye, place_m = ends(missed)
     of_clique = of_clique ** count_sides(rows.clique[missed], eye - place_m, n, settings)
+    behind = np.where(sight == 2, of_clique, 1.0)  # with a witness behind, whichever says more
+    of_clique[through] = np.minimum(behind, 1.0 - space.p_clear)[through]
     np.fill_diagonal(near, False)
     together = np.exp(near @ np.log(p_gone))
     of_clique = np.where(alone, of_clique / (of_clique + (1.0 - of_clique) * together), of_clique)
-    return counts, sight, of_clique, share, of_kind
+    return counts, sight, of_clique, share, of_kind, space.learned
 
 
-def count_sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> FloatArray:
-    """(C,) number of sides from which each of `n` cliques was looked at, at least one, by the cliques (N,) of the looks
-    that count and missed, and (N, 2) from the places to the sensor.
-
-    A side is a sector with enough looks. Their number is the mean over the directions in which sectors may begin,
-    counted from the mean direction of the looks: it grows steadily with the angle that looks span, and a map that is
-    turned has the same.
+def _through_space(
+    living: LivingMap,
+    p_start: FloatArray,
+    rows: SiteLooks,
+    new: tuple[BoolArray, BoolArray],
+    unlooked: BoolArray,
+    p_gone: FloatArray,
+    nominal: FloatArray,
+    ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
+    settings: LooksConfig,
+) -> OpenSpace:
+    """Return what is said of cliques along lines (N,) that were new before the session, and of looks (N,) along those
+    that still are; of (C,) cliques at which nobody looked along others. A site counts where a clique is believed, and
+    if an earlier session found it.
     """
-    every = settings.sides * _STARTS
-    angle = np.arctan2(away[:, 1], away[:, 0])
-    east, north = (np.bincount(clique, some, minlength=n) for some in (np.cos(angle), np.sin(angle)))
-    turned = np.mod((angle - np.arctan2(north, east)[clique]) * (every / (2.0 * np.pi)) + 0.5, every)
-    part = np.floor(turned).astype(np.int64) % every
-    looks = np.bincount(clique * every + part, minlength=n * every).reshape(n, every)
-    sums = np.cumsum(np.hstack([looks, looks[:, : _STARTS - 1]]), axis=1)
-    within = sums[:, _STARTS - 1 :] - np.hstack([np.zeros((n, 1), dtype=np.int64), sums[:, : every - 1]])
-    enough = within >= settings.witnesses
-    return np.asarray(np.clip(enough.sum(axis=1) / _STARTS, 1.0, settings.most_sides))
+    n, (was_new, is_new), lines = len(unlooked), new, living.sightlines
+    known = np.isin(living.sites.site_id, lines.site_id)
+    asked = np.flatnonzero(was_new & known[rows.site] & (p_start[rows.site] >= 0.5))
+    clique, hit = rows.clique[asked], rows.hit[asked]
+    elsewhere, stands, shown = (
+        np.bincount(some, minlength=n) > 0
+        for some in (rows.clique[rows.hit & ~known[rows.site]], rows.clique[rows.hit], clique[hit])
+    )
+    before = lines.open_space if len(lines.open_space) else np.array(lines.rules.open_space)
+    seen = np.flatnonzero(rows.hit)
+    seen = seen[np.unique(rows.key[seen], return_index=True)[1]]
+    space = weigh_new_lines(
+        Rays(*ends(seen), rows.clique[seen]),
+        NewLooks(clique, rows.key[asked], hit, nominal[asked], *ends(asked)),
+        np.where(stands, LEAST_GONE, p_gone),
+        ~elsewhere & (shown | stands | unlooked),
+        before,
+        lines.rules.clear,
+        settings,
+    )
+    p_clear = np.where(unlooked & ~stands, space.p_clear, 0.0)
+    counts = np.zeros(len(rows), dtype=np.bool_)
+    counts[asked] = space.counts & is_new[asked] & (p_clear > 0.0)[clique]
+    learned = lines.open_space if space.learned is before else space.learned
+    return space._replace(counts=counts, p_clear=p_clear, learned=learned)
 
 
 def _p_hidden(

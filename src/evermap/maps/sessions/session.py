@@ -365,6 +365,7 @@ def learned(judged: Judged, classes: ClassLives | None, config: LivingConfig) ->
         weight = np.where(seen.settled, 1.0, judged.now.sites.p_here[seen.rows.site])
         names = places.site_id, places.landmark_id
         lines = lines.learned(names, seen.place, seen.cell, seen.rows.hit, weight, seen.rate)
+        lines = replace(lines, open_space=seen.open_space)
         views = views.seen_from(judged.watch.eye, after.stamp_s, seen.rate)
         glimpses = glimpses.joined(judged.watch.glimpsed_m, after.stamp_s)
     lives = after.lives if classes is None else classes.lives

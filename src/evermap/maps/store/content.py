@@ -63,7 +63,7 @@ _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s
           "metres.log_metre", "metres.log_variance", "metres.information", "traits.landmark_id",
           "traits.column_id", "traits.value", "traits.sessions", "renamed.landmark_id", "renamed.name",
           "glimpses.position_m", "glimpses.stamp_s", "lives.log_factor", "lives.hourly_class_id",
-          "lives.hours_known")  # fmt: skip
+          "lives.hours_known", "sightlines.open_space", "sight.lines.like.open_space")  # fmt: skip
 """Written only if present, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -377,13 +377,14 @@ _NEXT_FREE = {
 _FINITE = (
     "places.position_m", "stays.position_m", "log_size_variance", "dated.stamp_s", "lives.chunk_m",
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
-    "boxes.size_m", "traits.value", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
-    "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance", "glimpses.position_m",
-    "glimpses.stamp_s", "lives.log_factor",
+    "sightlines.open_space", "boxes.size_m", "traits.value", "views.cell_m", "views.stamp_s", "views.frames",
+    "stays.first_s", "stays.last_s", "sites.since_s", "sites.seen_s", "metres.log_metre", "metres.log_variance",
+    "glimpses.position_m", "glimpses.stamp_s", "lives.log_factor",
 )  # fmt: skip
 _NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "lives.hours_known", "stamp_s", "session_start_s")
 _PROBABILITIES = ("sites.p_here", "sites.p_kept", "stays.p_gone")
-_COUNTS = ("sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown", "views.frames")
+_COUNTS = ("sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
+           "sightlines.open_space", "views.frames")  # fmt: skip
 
 
 def flaw(living: LivingMap) -> str:
@@ -413,6 +414,8 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
     lines, places = living.sightlines, len(living.places)
     if len(lines.hidden) != len(lines.rules.p_hidden) or len(lines.shown) != len(lines.rules.p_hidden):
         yield "'sightlines.hidden' of another length"
+    if len(lines.open_space) not in (0, len(lines.rules.open_space)):
+        yield "'sightlines.open_space' of another length"
     dim, covariance = living.dim, living.covariance_m2
     of_row = {"position_m": (dim,), "rotation": (TURNS[dim],), "rotation_covariance": (AXES[dim], AXES[dim])}
     for column in ("places.position_m", "stays.position_m", "places.rotation", "places.rotation_covariance"):

@@ -116,11 +116,11 @@ class Parking(NamedTuple):
         """Return the slots that are taken."""
         return {one.slot for one in self.spells if one.from_s <= stamp_s < one.until_s}
 
-    def find_passed(self, part: tuple[float, float] = (0.0, 1.0)) -> set[int]:
-        """Return the slots that a drive along a part of the path passes."""
-        n = len(self.path)
-        beside = self.beside
-        low, high = part[0] * n + 12, part[1] * n + 25
+    def find_passed(self, part: tuple[float, float] = (0.0, 1.0), *, back: bool = False) -> set[int]:
+        """Return the slots that a drive along a part of the path passes, `back` or forth."""
+        n, beside = len(self.path), self.beside
+        before, beyond = (-25, -12) if back else (12, 25)
+        low, high = part[0] * n + before, part[1] * n + beyond
         return set(np.flatnonzero((beside >= low) & (beside < high)).tolist())
 
     @property
@@ -151,6 +151,7 @@ class Parking(NamedTuple):
         origin: FloatArray | None = None,
         moving: int = 3,
         back: bool = False,
+        aside_m: float = 0.0,
     ) -> SpatialRecording:
         """Return a drive along a part of the street, as an odometry and a detector of boxes see it.
 
@@ -162,10 +163,12 @@ class Parking(NamedTuple):
             origin: (7,) pose of the street in the frame of the odometry; None for that of the first pose.
             moving: cars that drive, too.
             back: from the end to the beginning.
+            aside_m: how far left of the path, as the street is drawn.
         """
         rng = np.random.default_rng(seed)
         n = len(self.path)
-        path = self.path[int(part[0] * n) : int(part[1] * n)]
+        path = self.path[int(part[0] * n) : int(part[1] * n)].copy()
+        path[:, :2] += aside_m * np.column_stack([-np.sin(path[:, 2]), np.cos(path[:, 2])])
         path = path[::-1] + [0.0, 0.0, np.pi] if back else path
         stamp_s = start_s + np.arange(len(path), dtype=np.float64) * STEP_S
         pose = upright(path)
