@@ -180,7 +180,11 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
         prior=prior,
     )
     optimum = converged(problem, replace(estimate, place=place), solved.optimum.noise, heavy_rounds=0)
-    return replace(solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head])
+    return replace(
+        solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head],
+        moves=tuple(one._replace(before=int(part[one.before]), after=int(part[one.after])) for one in solved.moves),
+        bodies=tuple(one._replace(before=part[one.before], after=part[one.after]) for one in solved.bodies),
+    )  # fmt: skip
 
 
 def _same(seen: SeenBoxes, settings: BoxesConfig) -> tuple[IntArray, IntArray]:
