@@ -165,7 +165,7 @@ def join_links(links: Links, recording: AnyRecording, config: Config) -> Ownersh
         things, column = np.unique(links.thing, return_inverse=True)
         size, best = len(names) + len(things), np.zeros(len(names))
         edges = csr_array((np.ones(len(row)), (row, len(names) + column)), shape=(size, size))
-        body = connected_components(edges, directed=False)[1][: len(names)]
+        body = connected_components(edges, directed=False)[1][: len(names)].astype(np.int64)
         np.maximum.at(best, row, links.probability)
         unfit = UNKNOWN if seen is None else _find_unfit(seen, names, body, best)
         if unfit == UNKNOWN:

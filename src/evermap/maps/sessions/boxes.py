@@ -157,7 +157,7 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1].ravel()]
     i, j = _same(seen, settings)
     one, other = np.concatenate([np.arange(count), seen.place[i]]), np.concatenate([first, seen.place[j]])
-    part = connected_components(csr_array((np.ones(len(one)), (one, other)), shape=(count, count)))[1]
+    part = connected_components(csr_array((np.ones(len(one)), (one, other)), shape=(count, count)))[1].astype(np.int64)
     if part.max(initial=-1) + 1 == count:
         return solved
     began = np.full(count, np.inf)

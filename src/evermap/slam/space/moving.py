@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -221,7 +221,7 @@ def _with_places_of(problem: SpatialProblem, other: SpatialProblem) -> tuple[Spa
     """
     order = np.argsort(np.append(problem.pose_row, other.pose_row), kind="stable")
     shifted = replace(other, place=other.place + len(problem.oriented))
-    columns = {
+    columns: dict[str, Any] = {
         name: np.concatenate([getattr(problem, name), getattr(shifted, name)])[order] for name in problem.COLUMNS
     }
     symmetries = Symmetries(problem.symmetries.kinds, np.append(problem.symmetries.of, other.symmetries.of))
