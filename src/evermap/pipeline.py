@@ -109,12 +109,14 @@ class _Case:
 def _screen(recording: AnyRecording, prior_map: Landmarks | None, config: Config) -> _Case:
     """Return a recording in its space, without what is certainly wrong with it."""
     from evermap.slam import check, plane
+    from evermap.slam.ownership import with_owned
     from evermap.slam.votes import list_doubled_ids
 
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
+    recording, owned = with_owned(recording, config)
     read, prior_map, told = plane.with_prior(recording, prior_map, config.slam)
     recording, remarks, found = check.screened(read, config, prior_map)
-    remarks, found = (*(one.message for one in riders), *told, *remarks), (*riders, *found)
+    remarks, found = (*(one.message for one in riders), *owned, *told, *remarks), (*riders, *found)
     return _Case(config, read, recording, prior_map, remarks, found, list_doubled_ids(read, recording))
 
 
@@ -297,15 +299,19 @@ def run_session(
     """
     from evermap.maps.sessions import boxes, nameless, planar, session
     from evermap.slam import check
+    from evermap.slam.ownership import with_owned
     from evermap.slam.space.moving import has_traffic
 
     config = config or Config()
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
+    stated = recording.objects
+    recording, owned = with_owned(recording, config)
     recording = session.with_overlap(session.in_its_space(recording, living, config), living)
-    living, whole = session.opened(living, recording), recording
+    living, whole = session.opened(living, recording), replace(recording, objects=stated)
     located: Localised[PlanarVisit] | Localised[SpatialVisit]
     if is_in_space(recording):
         recording, remarks, found = check.screened(nameless.without_ids(recording, config), config)
+        remarks = (*owned, *remarks)
         session.check_static(recording, config)
         recording, living = session.admitted(recording, living)
         if config.slam.unknown_ids:

@@ -66,6 +66,7 @@ class TrafficConfig(Section):
     witnesses: Count = rule(10, "fewest objects that must show a drift of the odometry")
     better_by: float = rule(2.0, "factor by which their residuals must become smaller", ge=1.0)
     tilt_rad: Positive = rule(0.05, "boxes are upright to within this [rad]")
+    beside_s: Positive = rule(1.0, "time to a look at a landmark within which that locates the robot [s]")
 
 
 class BodiesConfig(Section):
@@ -74,6 +75,8 @@ class BodiesConfig(Section):
     limit_mps: Positive = key(0.15, "speed at which it is as probable that a body stands as that it moves [m/s]")
     margin_s: NotNegative = rule(0.5, "time before and after a motion in which nothing of it is used [s]")
     unseen_s: Positive = key(5.0, "a body that was not seen for longer may have moved in the meantime [s]")
+    lost_s: Positive = rule(1.0, "a box that comes back elsewhere after this time may be around another body [s]")
+    stray_m: Positive = rule(0.3, "radius of one of the places of a landmark that is on no known body, at least [m]")
 
 
 class UpConfig(Section):

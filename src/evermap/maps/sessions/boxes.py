@@ -157,7 +157,7 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1].ravel()]
     i, j = _same(seen, settings)
     one, other = np.concatenate([np.arange(count), seen.place[i]]), np.concatenate([first, seen.place[j]])
-    part = connected_components(csr_array((np.ones(len(one)), (one, other)), shape=(count, count)))[1]
+    part = connected_components(csr_array((np.ones(len(one)), (one, other)), shape=(count, count)))[1].astype(np.int64)
     if part.max(initial=-1) + 1 == count:
         return solved
     began = np.full(count, np.inf)
@@ -180,7 +180,11 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
         prior=prior,
     )
     optimum = converged(problem, replace(estimate, place=place), solved.optimum.noise, heavy_rounds=0)
-    return replace(solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head])
+    return replace(
+        solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head],
+        moves=tuple(one._replace(before=int(part[one.before]), after=int(part[one.after])) for one in solved.moves),
+        bodies=tuple(one._replace(before=part[one.before], after=part[one.after]) for one in solved.bodies),
+    )  # fmt: skip
 
 
 def _same(seen: SeenBoxes, settings: BoxesConfig) -> tuple[IntArray, IntArray]:

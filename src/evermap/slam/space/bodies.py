@@ -30,6 +30,12 @@ NEAR_S = 0.5
 ROUNDS = 2
 ELSEWHERE, SLACK_M, SLACK_RAD = 4.0, 0.05, 0.05
 """Standard deviations by which two places of a rest differ at least, with these errors more."""
+STRAY_LOOKS, MOST_LOOKS = 6, 200
+"""Looks at a landmark that are compared, at least and at most."""
+STRAY, MOST_STRAY = 0.15, 0.3
+"""Share of the looks that are at neither of its two usual places, from which a landmark is on a body that moves; and
+the share of those on no body of which that may be so.
+"""
 
 FEWEST = 3
 """Landmarks on no body that tell where a session is in a map, at least."""
@@ -71,12 +77,51 @@ def with_rests(intake: SpatialIntake, recording: SpatialRecording, settings: Sti
     if not problem.driven or not (body != UNKNOWN).any():
         return intake
     rest = np.full(len(body), UNKNOWN)
+    strays = find_strays(problem, *_poses(intake, body, rest), body_of)
+    body_of = np.where(strays, body_of.max() + np.cumsum(strays), body_of)
+    body = body_of[problem.place]
     for _ in range(ROUNDS):
         estimate, uncovered_m = _poses(intake, body, rest)
         before, rest = rest, _find_rests(problem, estimate, uncovered_m, body, settings)
         if not uncovered_m.any() or np.array_equal(rest, before):
             break
     return _with_places(intake, estimate, body_of, rest)
+
+
+def find_strays(
+    problem: SpatialProblem, estimate: SpatialEstimate, uncovered_m: FloatArray, body_of: IntArray
+) -> BoolArray:
+    """Return (L,) landmarks on no known body that are seen at so many places that they are on one.
+
+    At two places is what moved once; a wrong identity is elsewhere for a look. Where bodies move, what is on one that
+    nobody knows of is no error. Too many would say that the poses are wrong.
+
+    Args:
+        problem: a place for each landmark.
+        estimate: poses by what is on no body.
+        uncovered_m: (M,) errors of positions by the odometry.
+        body_of: (L,) known bodies.
+    """
+    at = as_seen(problem, estimate, problem.measured)[:, :3]
+    sigma_m = np.hypot(_sigmas_of(problem), uncovered_m * np.sqrt(NEAR_S))
+    found, least_m = np.zeros(len(body_of), dtype=np.bool_), problem.settings.bodies.stray_m
+    for one in np.flatnonzero(body_of == UNKNOWN).tolist():
+        mine = np.flatnonzero(problem.place == one)
+        mine = mine[np.unique(np.linspace(0, len(mine) - 1, min(len(mine), MOST_LOOKS)).astype(np.int64))]
+        if len(mine) < STRAY_LOOKS:
+            continue
+        near = np.linalg.norm(at[mine, None] - at[mine], axis=2) < np.maximum(least_m, ELSEWHERE * sigma_m[mine])
+        left = np.ones(len(mine), dtype=np.bool_)
+        for _ in range(2):
+            left &= ~near[int(np.argmax((near & left).sum(axis=1)))]
+        found[one] = np.mean(left) > STRAY
+    return found if found.sum() <= MOST_STRAY * np.count_nonzero(body_of == UNKNOWN) else np.zeros_like(found)
+
+
+def _sigmas_of(problem: SpatialProblem) -> FloatArray:
+    """(M,) errors of positions, and of the poses beside a landmark on no body."""
+    own = (np.linalg.inv(problem.measured_root) ** 2).sum(axis=(1, 2)) / 3.0
+    return np.asarray(np.sqrt(own + STILL_M**2))
 
 
 def _poses(intake: SpatialIntake, body: IntArray, rest: IntArray) -> tuple[SpatialEstimate, FloatArray]:
@@ -124,8 +169,7 @@ def _find_rests(
     """(M,) rests of bodies that detections are of, numbered over all bodies; `UNKNOWN` while they move."""
     found, count = np.full(len(body), UNKNOWN), 0
     at = as_seen(problem, estimate, problem.measured)[:, :3]
-    sigma_m = np.sqrt((np.linalg.inv(problem.measured_root) ** 2).sum(axis=(1, 2)) / 3.0)
-    sigma_m = np.sqrt(sigma_m**2 + STILL_M**2 + uncovered_m**2 * settings.window_s)
+    sigma_m = np.hypot(_sigmas_of(problem), uncovered_m * np.sqrt(settings.window_s))
     stamp_s = problem.seen_s
     for one in np.unique(body[body != UNKNOWN]):
         mine = np.flatnonzero(body == one)

@@ -3,6 +3,9 @@
 The tracker gives the boxes identities where the odometry has the robot; what stands by them shows the errors that
 odometry and detector repeat (`gauge`); with these taken off, the tracker is asked again, until nothing changes. What
 stands is then a landmark for as long as it does, and the rest is the solver's.
+
+Where landmarks with identities locate the robot, they are solved first, as in a recording without boxes: with noise of
+the odometry, and with rests of bodies. Boxes are then followed along that path, and what stands joins the solution.
 """
 
 from __future__ import annotations
@@ -10,18 +13,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
-from evermap.config import SpaceConfig, TrackConfig, TrafficConfig
+from evermap.config import SpaceConfig, StillConfig, TrackConfig, TrafficConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
-from evermap.slam.intake import most_of
+from evermap.geometry.symmetry import Symmetries
+from evermap.slam.intake import most_of, usable_detections
+from evermap.slam.space.bodies import FEWEST, with_rests
+from evermap.slam.space.bridge import bridge
 from evermap.slam.space.drift import Gauge, gauge_of
-from evermap.slam.space.estimate import converged
+from evermap.slam.space.estimate import converged, first_places
 from evermap.slam.space.intake import SpatialIntake, prepare_space, scale_between
+from evermap.slam.space.problem import SpatialProblem
 from evermap.slam.space.result import concluded_in_space, distinguished
+from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import SpatialSolved, solve_space, times_of
 from evermap.tracking.frame import Poses, box_table, boxes_of, in_world, mounts_of, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
@@ -46,6 +54,8 @@ from evermap.types import (
 ROUNDS = 4
 SETTLED = 0.2
 """Standard deviations by which the gauge changes in the last round, at most."""
+MOSTLY = 0.5
+"""Share of the frames beside looks at landmarks that it takes to locate a robot by these."""
 WANDERS = 0.03, 0.003
 """From where the noise of an odometry that wanders is sought [m/sqrt(s), rad/sqrt(s)]."""
 
@@ -99,6 +109,9 @@ class TrafficIntake:
         used: (K,) rows of the detections that have an identity for the solver.
         standing: the recording with these only, without errors that repeat themselves.
         intake: of that.
+        located: the solution of landmarks with identities alone, where these locate the robot; else None, and
+            static boxes do.
+        boxes: of these beside landmarks that locate the robot; None without any.
     """
 
     recording: SpatialRecording
@@ -110,6 +123,8 @@ class TrafficIntake:
     used: IntArray
     standing: SpatialRecording
     intake: SpatialIntake
+    located: SpatialSolved | None = None
+    boxes: SpatialProblem | None = None
 
 
 def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: TrackConfig) -> TrafficIntake:
@@ -122,15 +137,124 @@ def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: Trac
     # the prior of the ranges' scale is what kind and data sheet of the sensors state
     sigma = max(scale_between(recording.sensors, space, space.traffic.sigma_scale)[0], 1e-6)
     space = space.model_copy(update={"traffic": space.traffic.model_copy(update={"sigma_scale": sigma})})
+    if is_located(recording, space.traffic):
+        return _taken_beside_landmarks(recording, rows, driven, space, track)
     return _taken(recording, rows, driven, *_settled(recording, driven, space, track), space)
+
+
+def is_located(recording: SpatialRecording, settings: TrafficConfig) -> bool:
+    """Return whether landmarks with identities, on no known body, locate the robot for most of the time."""
+    seen, stamp_s = recording.detections, recording.frames.stamp_s
+    named = (seen.landmark_id != UNKNOWN) & ~np.isfinite(seen.size_m).all(axis=1)
+    named &= ~np.isin(seen.landmark_id, recording.objects[:, 0])
+    times = np.unique(seen.landmark_id[named], return_counts=True)[1]
+    if np.count_nonzero(times > 1) < FEWEST:
+        return False
+    seen_s, beside_s = np.unique(stamp_s[seen.frame[named]]), settings.beside_s
+    near = np.searchsorted(seen_s, stamp_s + beside_s, side="right") > np.searchsorted(seen_s, stamp_s - beside_s)
+    return bool(np.mean(near) > MOSTLY)
+
+
+def _taken_beside_landmarks(
+    recording: SpatialRecording, rows: IntArray, driven: FloatArray, space: SpaceConfig, track: TrackConfig
+) -> TrafficIntake:
+    """The recording as the solver takes it where landmarks locate the robot, with their solution."""
+    boxes, given = boxes_of(recording), recording.detections
+    others = rows_of(given, np.setdiff1d(np.arange(len(given)), boxes))
+    named = with_rests(prepare_space(recording, space), recording, track.still)
+    remarks = usable_detections(recording, ())[2], usable_detections(replace(recording, detections=others), ())[2]
+    named = replace(named, warnings=(*remarks[1], *named.warnings[len(remarks[0]) :]))  # boxes are not left out
+    solved = solve_space(named, None)
+    optimum = solved.optimum
+    path = bridge(named.frames, optimum.smoother.problem, optimum.estimate, optimum.noise)
+    path = se3.interpolate(recording.frames.stamp_s[named.frames.row], path, recording.frames.stamp_s)
+    stays, gauge = _settled(recording, path, space, track, bends=False)
+    known, range_m = _first_free(recording), np.linalg.norm(given.position_sensor_m[boxes], axis=1)
+    identity, variance = np.full(len(given), UNKNOWN), given.covariance_sensor_m2.copy()
+    identity[boxes] = np.where(stays.stay == UNKNOWN, UNKNOWN, known + stays.stay)
+    sigma_m = track.still.sigma_m + track.still.sigma_share * range_m
+    variance[boxes] = sigma_m[:, None, None] ** 2 * np.eye(3)
+    position, rotation = given.position_sensor_m.copy(), given.rotation.copy()
+    position[boxes] *= gauge.range_scale
+    rotation[boxes] = np.nan  # as of boxes alone
+    seen = replace(
+        given, landmark_id=identity, position_sensor_m=position, rotation=rotation, covariance_sensor_m2=variance
+    )
+    intake, at_rest = named, None
+    if (identity != UNKNOWN).any():
+        beside = prepare_space(replace(recording, detections=seen), space, fewest=0)
+        at_rest = _share_alike(beside.problem, track.still)
+        intake = _joined(named, replace(beside, problem=at_rest))
+    seen = replace(seen, landmark_id=np.where(identity == UNKNOWN, given.landmark_id, identity))
+    standing = replace(recording, detections=seen, warnings=())
+    everything = np.arange(len(given))
+    return TrafficIntake(recording, rows, driven, stays, gauge, known, everything, standing, intake, solved, at_rest)
+
+
+def _share_alike(problem: SpatialProblem, settings: StillConfig) -> SpatialProblem:
+    """The problem with boxes whose errors are alike for a while counted once in that time."""
+    stamp_s, share = problem.seen_s, np.ones(len(problem.place))
+    for one in np.unique(problem.place):
+        mine = np.flatnonzero(problem.place == one)
+        share[mine] = min(1.0, max(1.0, np.ptp(stamp_s[mine]) / max(settings.alike_s, 1e-6)) / len(mine))
+    return replace(problem, share=share)
+
+
+def _joined(named: SpatialIntake, beside: SpatialIntake) -> SpatialIntake:
+    """The input of landmarks with static boxes behind them, of the same frames."""
+    problem, order = _with_places_of(named.problem, beside.problem)
+    count = len(beside.landmark_id)
+    bodies = np.append(named.bodies, np.full(count, UNKNOWN)) if len(named.bodies) else named.bodies
+    return replace(
+        named,
+        problem=problem,
+        used=np.append(named.used, beside.used)[order],
+        landmark_id=np.append(named.landmark_id, beside.landmark_id),
+        boxes=np.append(named.boxes, beside.boxes),
+        bodies=bodies,
+    )
+
+
+def _with_places_of(problem: SpatialProblem, other: SpatialProblem) -> tuple[SpatialProblem, IntArray]:
+    """The problem with places and detections of another one of the same poses, at noise levels that are known; and the
+    order of all detections.
+    """
+    order = np.argsort(np.append(problem.pose_row, other.pose_row), kind="stable")
+    shifted = replace(other, place=other.place + len(problem.oriented))
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(problem, name), getattr(shifted, name)])[order] for name in problem.COLUMNS
+    }
+    symmetries = Symmetries(problem.symmetries.kinds, np.append(problem.symmetries.of, other.symmetries.of))
+    joined = replace(
+        problem, **columns, oriented=np.append(problem.oriented, other.oriented), symmetries=symmetries,
+        estimate_noise=False,
+    )  # fmt: skip
+    return joined, order
+
+
+def _with_boxes(solved: SpatialSolved, boxes: SpatialProblem, first_box: int) -> SpatialSolved:
+    """The solution of landmarks with static boxes, rows from `first_box` on, whose errors change none of its levels."""
+    optimum, (fitted, _) = solved.optimum, solved.optimum.last
+    begun = first_places(boxes, optimum.estimate.pose)
+    estimate = replace(optimum.estimate, place=np.vstack([optimum.estimate.place, begun.place]))
+    smoother = SpatialSmoother(_with_places_of(fitted.problem, boxes)[0], estimate.pose)
+    estimate, now = smoother.optimum(estimate, optimum.noise, heavy=False)
+    counted = SpatialSmoother(_with_places_of(optimum.smoother.problem, boxes)[0], estimate.pose)
+    levels = optimum.noise if optimum.sober is None else optimum.sober
+    found = replace(
+        optimum, estimate=estimate, smoother=counted, now=counted.linearised(estimate, levels, heavy=False),
+        fitted=(smoother, now),
+    )  # fmt: skip
+    count = len(boxes.oriented)
+    identity = np.append(solved.identity, first_box + np.arange(count))
+    return replace(solved, optimum=found, identity=identity, number=np.append(solved.number, np.ones(count, dtype=int)))
 
 
 def _taken(
     recording: SpatialRecording, rows: IntArray, driven: FloatArray, stays: Stood, gauge: Gauge, space: SpaceConfig
 ) -> TrafficIntake:
     """The recording as the solver takes it, with the errors taken off that repeat themselves."""
-    identity = recording.detections.landmark_id.copy()
-    known = int(identity.max(initial=UNKNOWN)) + 1
+    identity, known = recording.detections.landmark_id.copy(), _first_free(recording)
     identity[boxes_of(recording)] = np.where(stays.stay == UNKNOWN, UNKNOWN, known + stays.stay)
     standing_only = _standing_only(recording, driven, gauge, identity)
     intake = prepare_space(standing_only, space, fewest=0)
@@ -157,6 +281,10 @@ def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> 
     Raises:
         NumericalError: no finite optimum.
     """
+    if taken.located is not None:
+        if taken.boxes is None:
+            return taken.located
+        return _with_boxes(taken.located, taken.boxes, int(np.searchsorted(taken.intake.landmark_id, taken.known)))
     solved = solve_space(taken.intake, None, progress=progress)
     optimum, problem = solved.optimum, solved.optimum.smoother.problem
     if len(np.unique(problem.place)) < problem.settings.traffic.witnesses:
@@ -172,7 +300,7 @@ def conclude_in_traffic(
 ) -> tuple[SlamResult, TrackResult | None]:
     """Return poses and static objects, with rows of detections of `taken.recording`; and tracks along these poses."""
     result = concluded_in_space(taken.standing, intake, solved)
-    followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.gauge, track)
+    followed = follow_boxes(taken.recording, result.trajectory.pose_world_robot, taken.gauge, track)
     alone = se3.compose(result.trajectory.pose_world_robot[0], taken.driven)
     return replace(
         result,
@@ -199,14 +327,16 @@ def _whole(recording: SpatialRecording) -> tuple[SpatialRecording, IntArray]:
 
 
 def _settled(
-    recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig
+    recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig, *, bends: bool = True
 ) -> tuple[Stood, Gauge]:
-    """Return static objects and systematic errors, alternated until the errors no longer change."""
+    """Return static objects and systematic errors, alternated until the errors no longer change; `bends` is whether the
+    path may have one.
+    """
     rows, stamps, gauge = boxes_of(recording), recording.frames.stamp_s, Gauge.before(space)
     mount, frame = mounts_of(recording)[rows], recording.detections.frame[rows]
     seen = se3.transform(mount, recording.detections.position_sensor_m[rows])
     for _ in range(ROUNDS):
-        followed = _followed(recording, gauge.applied(driven), gauge, track)
+        followed = follow_boxes(recording, gauge.applied(driven), gauge, track)
         stands = _stands(recording, followed)
         if followed is None:
             break
@@ -214,6 +344,7 @@ def _settled(
         thing = stands.stay if gauge.things else long_enough(stamps[frame], followed.track_of_detection, track.still)
         on = np.flatnonzero(thing != UNKNOWN)
         found = gauge_of(driven, stamps[frame[on]], frame[on], seen[on], mount[on, :3], thing[on], space, track.still)
+        found = found if bends else found._replace(bend=0.0)
         change = abs(found.scale - gauge.scale) / found.scale_sigma + abs(found.bend - gauge.bend) / found.bend_sigma
         gauge = found
         if change < SETTLED:
@@ -221,7 +352,12 @@ def _settled(
     return stands, gauge
 
 
-def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track: TrackConfig) -> TrackResult | None:
+def _first_free(recording: SpatialRecording) -> int:
+    """The first identity above those of landmarks."""
+    return int(recording.detections.landmark_id.max(initial=UNKNOWN)) + 1
+
+
+def follow_boxes(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track: TrackConfig) -> TrackResult | None:
     """Return the tracks of the boxes, with the robot at poses (F, 7)."""
     table, poses = (
         box_table(recording, gauge.range_scale),

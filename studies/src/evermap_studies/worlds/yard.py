@@ -6,8 +6,8 @@ nothing but the robot moves, and all else is the same: what it sees is worth wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from evermap.geometry import se3
 from evermap.geometry.group import accumulate
 from evermap.slam.plane import in_its_space
 from evermap.types import (
+    UNKNOWN,
     BoolArray,
     FloatArray,
     Frames,
@@ -40,6 +41,8 @@ LANE_M = 3.5
 ROBOT_MPS, SENSOR_HEIGHT_M = 1.2, 0.8
 FORKLIFT_M = 2.4, 1.2, 2.0
 FORKLIFT_MPS, FORKLIFT_MPS2 = 1.5, 0.7
+BOX_M, BOX_RAD, BOX_SHARE = 0.08, 0.05, 0.05
+"""Noise of a box: of its position along the floor, its heading, and its size, as a share of it."""
 PERSON_M = 0.3
 """Radius of one who walks."""
 FACING = 0.25
@@ -60,6 +63,7 @@ class YardConfig:
         people: who walk, and stand in the way of lines of sight.
         oriented: whether tags are seen with their orientation; else as points.
         stated: whether `Recording.objects` says which tags are on one forklift.
+        boxed: whether a detector reports boxes around forklifts, without identity.
         drive_s: how long a drive takes.
         reach_m, half_view_rad: how far the robot sees, and to either side.
         sigma_m, sigma_share, sigma_rad: noise of a tag's position at no range and as a share of it, and of its
@@ -78,6 +82,7 @@ class YardConfig:
     people: int = 4
     oriented: bool = True
     stated: bool = True
+    boxed: bool = False
     drive_s: float = 90.0
     reach_m: float = 10.0
     half_view_rad: float = 1.3
@@ -144,6 +149,8 @@ def simulate_yard(config: YardConfig | None = None, seed: int = 0) -> list[YardD
             ]
         )
         recording = _record(tag, body_of_tag, body, config, start_s, np.random.default_rng([seed, 2, k]))
+        if config.boxed:
+            recording = _with_boxes(recording, body, config, np.random.default_rng([seed, 4, k]))
         drives.append(YardDrive(recording, body, moves, tag, body_of_tag))
     return drives
 
@@ -295,6 +302,49 @@ def _record(
         objects=np.column_stack([carried, body_of_tag[carried]]),
         class_names=("tag",),
     )
+
+
+def _with_boxes(
+    recording: SpatialRecording, body: FloatArray, config: YardConfig, rng: np.random.Generator
+) -> SpatialRecording:
+    """The recording with boxes (length, width, height) of what is near and ahead, behind the tags of each frame."""
+    assert recording.truth is not None
+    given, truth = recording.detections, recording.truth.pose_world_robot
+    eye = truth + [0.0, 0.0, SENSOR_HEIGHT_M, 0.0, 0.0, 0.0, 0.0]
+    middle = upright(body)
+    middle[..., 2] = 0.5 * FORKLIFT_M[2]
+    local = se3.between(eye[None], middle)
+    range_m = np.linalg.norm(local[..., :3], axis=-1)
+    seen = (range_m < config.reach_m) & (np.abs(np.arctan2(local[..., 1], local[..., 0])) < config.half_view_rad)
+    seen &= rng.uniform(size=seen.shape) < config.p_detect
+    frame, one = np.nonzero(seen.T)
+    local, count = local[one, frame], len(frame)
+    local[:, :3] += rng.normal(size=(count, 3)) * [BOX_M, BOX_M, 0.5 * BOX_M]
+    turn = np.zeros((count, 6))
+    turn[:, 5] = BOX_RAD * rng.normal(size=count)
+    order = np.argsort(np.concatenate([given.frame, frame]), kind="stable")
+    unsaid = np.full(count, np.nan)
+    boxes = SpatialDetections(
+        frame=frame,
+        sensor=np.zeros(count, dtype=np.int64),
+        landmark_id=np.full(count, UNKNOWN),
+        position_sensor_m=local[:, :3],
+        rotation=se3.retract(local, turn)[:, 3:],
+        covariance_sensor_m2=np.full((count, 3, 3), np.nan),
+        sigma_rad=unsaid,
+        corner_px=np.full((count, 4, 2), np.nan),
+        tag_size_m=unsaid,
+        size_m=np.array(FORKLIFT_M) * np.exp(BOX_SHARE * rng.normal(size=(count, 3))),
+        class_id=np.ones(count, dtype=np.int64),
+        score=unsaid,
+        source_line=2 + len(given) + np.arange(count),
+    )
+    both: dict[str, Any] = {
+        column.name: np.concatenate([getattr(given, column.name), getattr(boxes, column.name)])[order]
+        for column in fields(given)
+        if isinstance(getattr(boxes, column.name), np.ndarray)
+    }
+    return replace(recording, detections=replace(given, **both), class_names=("tag", "forklift"))
 
 
 def _in_view(eye: FloatArray, tag: FloatArray, body: FloatArray, people: FloatArray, config: YardConfig) -> BoolArray:
