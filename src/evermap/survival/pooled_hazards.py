@@ -54,8 +54,8 @@ FINE_LINE, FAR = np.linspace(-6.0, 6.0, 241), [5, 11]
 STRAIGHT, HEAVIEST = 0.1, 16.0
 """Difference of log densities there up to which the normal one is kept; and the largest weight, in mean ones."""
 NO_LESS = 1e-6
-"""Share of the prior's information below zero that is rounding. That of no class may be less: what each of many loses of
-the prior would be lost to all of them together, which leaves a posterior that is none."""
+"""Share of the prior's information below zero that is rounding. That of no class may be less: what each of many loses
+of the prior would be lost to all of them together, which leaves a posterior that is none."""
 _SETTLED = 1e-4
 _EXACT = 1e-12
 """Relative error of a stated hazard."""
