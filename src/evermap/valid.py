@@ -16,6 +16,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.types import (
+    MASK_ID,
     UNKNOWN,
     AnyRecording,
     BoolArray,
@@ -120,14 +121,17 @@ SIGMA_RANGE_M = Quantity("sigma_range_m", 0.0, 1e6, positive=True, optional=True
 SIGMA_BEARING_RAD = Quantity(
     "sigma_bearing_rad", 0.0, 1e6, positive=True, optional=True, hint="leave empty where unknown"
 )
+MOST_MASKS = 2.0**53
+"""Numbers up to this are exact as float64."""
 FEATURES = (
     Quantity("radius_m", 0.0, 1e3, positive=True, optional=True, hint="metres; leave empty where it was not measured"),
     *(
         Quantity(f"colour_{one}", -1e6, 1e6, optional=True, hint="leave empty where it was not measured")
         for one in "rgb"
     ),
+    Quantity(MASK_ID, -MOST_MASKS, MOST_MASKS, optional=True, hint="the number of a mask; leave empty outside of all"),
 )
-"""Of a landmark itself; beside these `descriptor_0`, `descriptor_1` ... may be any numbers."""
+"""Of a landmark itself, and of its mask; beside these `descriptor_0`, `descriptor_1` ... may be any numbers."""
 CAMERA_MODELS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 """Number of distortion coefficients per camera model."""
 P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")

@@ -82,9 +82,9 @@ def test_two_files_are_enough(native: Files, lay_out: Callable, check_recording:
     assert any("no sensor.toml" in remark for remark in recording.warnings)
 
 
-LIKE = """stamp_s,landmark_id,range_m,bearing_rad,colour_g,radius_m,descriptor_1,descriptor_0,colour_r
-0.5,1,2,0.1,,0.25,-3,7,
-1.0,2,2,0.2,0.5,,,1e3,
+LIKE = """stamp_s,landmark_id,range_m,bearing_rad,colour_g,radius_m,descriptor_1,descriptor_0,colour_r,mask_id
+0.5,1,2,0.1,,0.25,-3,7,,12
+1.0,2,2,0.2,0.5,,,1e3,,-1
 """
 
 
@@ -95,9 +95,9 @@ def test_what_landmarks_are_like_arrives_and_is_written(
     native["detections.csv"] = LIKE
     recording = read_recording(lay_out(native))
     seen = recording.detections
-    assert seen.feature_names == ("radius_m", "colour_g", "descriptor_0", "descriptor_1")  # nothing is red
+    assert seen.feature_names == ("radius_m", "colour_g", "mask_id", "descriptor_0", "descriptor_1")  # nothing is red
     nan = np.nan
-    np.testing.assert_array_equal(seen.features, [[0.25, nan, 7.0, -3.0], [nan, 0.5, 1e3, nan]])
+    np.testing.assert_array_equal(seen.features, [[0.25, nan, 12.0, 7.0, -3.0], [nan, 0.5, -1.0, 1e3, nan]])
     again = read_recording(write_native(recording, tmp_path / "again", format=form))
     assert_same(again.detections, seen, frozenset({"source_line"}))
     assert_same(unpack_recording(pack_recording(recording)).detections, seen)
@@ -109,6 +109,7 @@ def test_what_landmarks_are_like_arrives_and_is_written(
     [
         (("radius_m", "0.2", "-1"), "radius_m", 3),
         (("colour_b", "", "red"), "colour_b", 3),
+        (("mask_id", "1", "1e16"), "mask_id", 3),
         (("descriptor_1", "1", "2"), "descriptor_0", 1),
         (("descriptor_x", "1", "2"), "descriptor_x", 1),
         (("radius", "1", "2"), "radius", 1),

@@ -233,12 +233,12 @@ def test_points_of_a_stereo_pair_have_a_depth_and_its_covariance(lay_out: Callab
 
 def test_what_landmarks_are_like(lay_out: Callable, space: Files, tmp_path: Path, assert_same: Callable) -> None:
     head, *rows = space["detections.csv"].splitlines()
-    more = [",radius_m,descriptor_0", ",0.25,-1.5", ",,3", ",,"]
+    more = [",radius_m,mask_id,descriptor_0", ",0.25,4,-1.5", ",,-1,3", ",,,"]
     space["detections.csv"] = "".join(f"{a}{b}\n" for a, b in zip([head, *rows], more, strict=True))
     recording = read_recording(lay_out(space))
     seen = recording.detections
-    assert seen.feature_names == ("radius_m", "descriptor_0")
-    np.testing.assert_array_equal(seen.features, [[0.25, -1.5], [np.nan, 3.0], [np.nan, np.nan]])
+    assert seen.feature_names == ("radius_m", "mask_id", "descriptor_0")
+    np.testing.assert_array_equal(seen.features, [[0.25, 4.0, -1.5], [np.nan, -1.0, 3.0], [np.nan] * 3])
     again = read_recording(write_native(recording, tmp_path / "again"))
     np.testing.assert_array_equal(again.detections.features, seen.features)
     assert_same(unpack_recording(pack_recording(recording)).detections, seen)

@@ -53,6 +53,7 @@ class Reckoned(NamedTuple):
     Attributes:
         landmark_id, stamp_s: of each.
         frame: of the recording.
+        row: of its detections.
         at: (N, D) in the frame of the odometry.
         sigma_m: (N,) error of that over `LAG_S`.
         own: (N, D) on the robot.
@@ -63,6 +64,7 @@ class Reckoned(NamedTuple):
     landmark_id: IntArray
     stamp_s: FloatArray
     frame: IntArray
+    row: IntArray
     at: FloatArray
     sigma_m: FloatArray
     own: FloatArray
@@ -125,9 +127,8 @@ def locate_by_odometry(recording: AnyRecording, settings: SpaceConfig) -> Reckon
         pose = np.hstack([np.zeros((len(rows), 3)), recording.detections.rotation[rows]])
         known = np.isfinite(pose).all(axis=1)
         turn[known] = se3.rotation_of(se3.compose(mounts_of(recording)[rows[known]], pose[known]))
-    return Reckoned(
-        seen.landmark_id[rows], stamp_s[rows], seen.frame[rows], at, np.hypot(noise_m, drift_m), own, noise_m, turn
-    )
+    sigma_m = np.hypot(noise_m, drift_m)
+    return Reckoned(seen.landmark_id[rows], stamp_s[rows], seen.frame[rows], rows, at, sigma_m, own, noise_m, turn)
 
 
 def find_movers(recording: AnyRecording, config: Config) -> Movers | None:

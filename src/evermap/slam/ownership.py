@@ -1,9 +1,9 @@
-"""Which landmarks are on one body, where nobody states it: by boxes around them, and by how they move.
+"""Which landmarks are on one body, where nobody states it: by boxes around them, by masks, and by how they move.
 
 A landmark that is seen on something may be on it, or behind it by chance. What is on it is seen there wherever it goes;
 what is not is seen there at one of its places at most. So each place counts once, whatever the number of looks, and a
-look at the landmark beside it counts against it. One look alone may be wrong, and decides nothing. Landmarks that move
-together (`co_motion`) are on one body, too.
+look at the landmark beside it counts against it. One look alone may be wrong, and decides nothing. So do two landmarks
+that lie in one mask of an image (`mask_owners`). Landmarks that move together (`co_motion`) are on one body, too.
 
 Membership is a probability. What is probable enough is taken into `Recording.objects`, where bodies are stated.
 """
@@ -27,9 +27,10 @@ from evermap.slam.co_motion import (
     locate_by_odometry,
     pair_movers,
 )
+from evermap.slam.mask_owners import is_scenery, see_masks
 from evermap.slam.space.box_owners import Sights, see_boxes
 from evermap.slam.space.moving import has_traffic
-from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray
+from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, is_in_space, masks_of
 
 PRIOR = 0.2
 """Probability that a landmark in view is on a body that is, too."""
@@ -39,6 +40,8 @@ BY_CHANCE = 0.05
 """Probability that one that is not is seen on it at one of its places, and that a look is wrong."""
 OWNED = 0.8
 """Probability from which a landmark is a member."""
+TINY = 1e-12
+"""Least probability that something is not so."""
 LOOK_S = 1.0
 """Looks within this time are one: errors are alike."""
 
@@ -86,8 +89,8 @@ def with_owned(recording: AnyRecording, config: Config) -> tuple[Any, tuple[str,
     for mine, stated in zip(number[a].tolist(), objects[b, 1].tolist(), strict=True):
         number = np.where(number == mine, stated, number)
     remark = (
-        f"{new.sum()} landmarks are taken to be on {len(np.unique(number[new]))} bodies, by boxes around them or as "
-        f"they move, with probabilities of at least {owned.probability[new].min():.2f}"
+        f"{new.sum()} landmarks are taken to be on {len(np.unique(number[new]))} bodies, by boxes around them, masks "
+        f"or as they move, with probabilities of at least {owned.probability[new].min():.2f}"
     )
     objects = np.vstack([objects, np.column_stack([owned.landmark_id, number])[new]])
     return replace(recording, objects=objects[np.argsort(objects[:, 0], kind="stable")]), (remark,)
@@ -98,16 +101,49 @@ def find_owned(recording: AnyRecording, config: Config) -> Ownership:
     found = list[Links]()
     if has_traffic(recording):
         found.append(find_links(see_boxes(recording, config)))
-    movers = find_movers(recording, config)
+    movers, seen = find_movers(recording, config), locate_by_odometry(recording, config.slam.space)
+    pairs, p = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     if movers is not None:
         pairs, p = pair_movers(movers, PRIOR, config.track.still)
-        sure = p >= OWNED
-        things = np.repeat(np.arange(np.count_nonzero(sure)), 2)
-        found.append(Links(pairs[sure].ravel(), things, np.repeat(p[sure], 2)))
+    mask = masks_of(recording.detections)
+    if seen is not None and np.isfinite(mask).any():
+        sensor = recording.detections.sensor if is_in_space(recording) else np.zeros(len(mask), dtype=np.int64)
+        by_mask = find_links(see_masks(seen, mask[seen.row], sensor[seen.row], pairs))
+        p = _weigh_with_masks(pairs, p, by_mask)
+        found.append(_link_masked(seen, sensor[seen.row], by_mask))
+    if movers is not None:
+        found.append(_link_pairs(pairs, p))
         if len(movers.landmark_id) > 1 or any(len(links.thing) for links in found):
             p = 1.0 / (1.0 + (1.0 - PRIOR) / PRIOR * np.exp(-movers.nats))  # what moves by itself is a body, too
             found.append(Links(movers.landmark_id, np.arange(len(p)), p))
-    return join_links(_append_links(found), recording, config)
+    return join_links(_append_links(found), seen)
+
+
+def _link_pairs(pairs: IntArray, p: FloatArray) -> Links:
+    """Each pair (P, 2) of landmarks that is probable enough, as on a thing of its own."""
+    sure = p >= OWNED
+    return Links(pairs[sure].ravel(), np.repeat(np.arange(np.count_nonzero(sure)), 2), np.repeat(p[sure], 2))
+
+
+def _weigh_with_masks(pairs: IntArray, p: FloatArray, by_mask: Links) -> FloatArray:
+    """Return probabilities (P,) of pairs that move together, with what masks say of the same ones.
+
+    A body may have several masks wherever it is seen; that bounds what they say against it.
+    """
+    said = {(int(one), int(other)): float(q) for other, one, q in zip(*by_mask, strict=True)}
+    together = np.array([said.get((min(pair), max(pair)), PRIOR) for pair in pairs.tolist()])
+    factor = BY_CHANCE + (1.0 - BY_CHANCE) * together / np.maximum(1.0 - together, TINY) * (1.0 - PRIOR) / PRIOR
+    return p * factor / (p * factor + 1.0 - p)
+
+
+def _link_masked(seen: Reckoned, sensor: IntArray, pairs: Links) -> Links:
+    """Pairs on one body by their masks; none on that of the scenery."""
+    links = _link_pairs(np.column_stack([pairs.thing, pairs.landmark_id]), pairs.probability)
+    found, each = join_links(links, None), links.landmark_id.reshape(-1, 2)
+    body = found.object_id[np.searchsorted(found.landmark_id, each[:, 0])]
+    scenery = [one for one in np.unique(body) if is_scenery(seen, sensor, each[body == one])]
+    kept = np.repeat(~np.isin(body, scenery), 2)
+    return Links(links.landmark_id[kept], links.thing[kept], links.probability[kept])
 
 
 def _append_links(found: Sequence[Links]) -> Links:
@@ -151,15 +187,14 @@ def weigh_looks(n_within: int, n_beside: int) -> float:
     return float(beside + owned - np.logaddexp(np.log(BY_CHANCE) + owned, wrong))
 
 
-def join_links(links: Links, recording: AnyRecording, config: Config) -> Ownership:
+def join_links(links: Links, seen: Reckoned | None) -> Ownership:
     """Return landmarks by body: two things are one body where a landmark is on both.
 
-    Of landmarks on one that were seen to move against each other the less probable one is on none.
+    Of landmarks on one that were `seen` to move against each other the less probable one is on none.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    seen = locate_by_odometry(recording, config.slam.space) if len(links.thing) else None
     while True:
         names, row = np.unique(links.landmark_id, return_inverse=True)
         things, column = np.unique(links.thing, return_inverse=True)

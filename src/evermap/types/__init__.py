@@ -31,6 +31,7 @@ from evermap.types.arrays import (
 from evermap.types.clock import Clock, between_text, stamp_text
 from evermap.types.landmarks import MOST_TILT_RAD, PLANE, Landmarks, Trajectory, Up
 from evermap.types.measured import (
+    MASK_ID,
     Detections,
     Frames,
     Measurements,
@@ -39,6 +40,8 @@ from evermap.types.measured import (
     RobotSightings,
     SpatialDetections,
     SpatialOdometry,
+    masks_of,
+    traits_of,
 )
 from evermap.types.names import (
     CODE_DIGITS,
@@ -81,6 +84,7 @@ __all__ = [
     "DEFAULT_PRIOR",
     "DEFAULT_P_FALSE",
     "DEFAULT_P_MISS",
+    "MASK_ID",
     "MOST_TILT_RAD",
     "NOT_IN_SPACE",
     "PLANE",
@@ -133,7 +137,9 @@ __all__ = [
     "landmark_code",
     "landmark_id_of",
     "landmark_label",
+    "masks_of",
     "or_nan",
     "rows_of",
     "stamp_text",
+    "traits_of",
 ]

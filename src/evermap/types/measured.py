@@ -12,6 +12,9 @@ from evermap.show import Shown, extent, span
 from evermap.types.arrays import UNKNOWN, ArrayTable, FloatArray, IntArray
 from evermap.types.clock import Clock
 
+MASK_ID = "mask_id"
+"""Column of features that is not of a landmark itself: the mask of an image that a detection lies in."""
+
 
 @dataclass(frozen=True, slots=True)
 class Odometry(ArrayTable):
@@ -66,8 +69,8 @@ class Detections(ArrayTable):
         class_id: (M,) row of `Recording.class_names`, or `UNKNOWN`.
         sigma_range_m, sigma_bearing_rad: (M,) standard deviations given for this very detection, nan where none is.
         source_line: (M,) line in the input file, for messages; 0 where there is none.
-        features: (M, D) what was measured of the landmark itself, as its radius or colour, nan where it was not; None
-            where nothing ever was.
+        features: (M, D) what was measured of the landmark itself, as its radius or colour, nan where it was not; and
+            the mask that it lies in (`MASK_ID`), negative or nan in none; None where nothing ever was.
         feature_names: (D,) what the columns of `features` are called.
     """
 
@@ -212,3 +215,19 @@ class SpatialDetections(ArrayTable):
     def _facts(self) -> dict[str, Any]:
         known = self.landmark_id[self.landmark_id != UNKNOWN]
         return {"rows": len(self), "landmarks": len(np.unique(known))}
+
+
+def traits_of(seen: Detections | SpatialDetections) -> tuple[FloatArray | None, tuple[str, ...]]:
+    """Return what was measured of landmarks themselves (M, D), None if nothing was, and what its columns are called."""
+    names = tuple(name for name in seen.feature_names if name != MASK_ID)
+    if seen.features is None or not names:
+        return None, ()
+    return seen.features[:, [name != MASK_ID for name in seen.feature_names]], names
+
+
+def masks_of(seen: Detections | SpatialDetections) -> FloatArray:
+    """Return the mask of its image that each detection (M,) lies in, nan for none."""
+    if seen.features is None or MASK_ID not in seen.feature_names:
+        return np.full(len(seen), np.nan)
+    number = seen.features[:, seen.feature_names.index(MASK_ID)]
+    return np.where(number >= 0.0, number, np.nan)

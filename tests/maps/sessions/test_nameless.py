@@ -20,14 +20,14 @@ from evermap.maps.sessions.believe import Witnessed
 from evermap.maps.sessions.decide import doubt_moves
 from evermap.maps.sessions.extend import Extended
 from evermap.maps.sessions.nameless import held_at, without_ids
-from evermap.maps.sessions.session import Session
+from evermap.maps.sessions.session import Session, with_traits
 from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
 from evermap.runs.edits import rename_landmark
 from evermap.runs.sessions import enter_session
 from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
-from evermap.types import UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, rows_of
+from evermap.types import MASK_ID, UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, rows_of
 from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
 
 from .buildings import FIXED, building, lived_through
@@ -288,6 +288,19 @@ def with_descriptors(recording: Recording, true: IntArray, session: int, shift: 
     value = own + 0.2 * np.random.default_rng([6, session]).normal(size=own.shape) + shift
     names = tuple(f"descriptor_{k}" for k in range(8))
     return replace(recording, detections=replace(recording.detections, features=value, feature_names=names))
+
+
+def test_masks_are_not_kept_of_landmarks(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    """A radius is; the mask that it was seen in is not of the landmark itself."""
+    _, sessions = lived
+    living, recording = sessions[0].living, sessions[0].recording
+    mask = np.ones((len(recording.detections), 1))
+    masked = replace(recording.detections, features=mask, feature_names=(MASK_ID,))
+    assert with_traits(living, replace(recording, detections=masked)) is living
+    both = replace(masked, features=np.hstack([mask, 0.2 * mask]), feature_names=(MASK_ID, "radius_m"))
+    traits = with_traits(living, replace(recording, detections=both)).traits
+    assert len(traits) > 0
+    assert np.unique(traits.value).tolist() == [0.2]
 
 
 @pytest.fixture(scope="module")

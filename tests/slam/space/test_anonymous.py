@@ -20,7 +20,7 @@ from evermap.maps.sessions.session import Session
 from evermap.slam.association import with_identities
 from evermap.slam.association.in_space import SpatialAssignment, SpatialAssociator
 from evermap.slam.space.intake import prepare_space
-from evermap.types import UNKNOWN, ChangeKind, Landmarks, SpatialRecording, rows_of
+from evermap.types import MASK_ID, UNKNOWN, ChangeKind, Landmarks, SpatialRecording, rows_of
 
 from .corridors import tagged_corridor
 from .halls import hall, part_of_hall, tilt
@@ -142,6 +142,7 @@ def test_two_at_one_place_are_told_apart_by_a_column():
     assert told.completeness > 0.8
     useless = random.normal(size=(len(seen), 1))
     np.testing.assert_array_equal(found(features=useless, feature_names=("colour",)), alone)
+    np.testing.assert_array_equal(found(features=radius[:, None], feature_names=(MASK_ID,)), alone)  # not of itself
 
 
 @pytest.mark.slow

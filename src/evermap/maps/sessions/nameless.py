@@ -52,6 +52,7 @@ from evermap.types import (
     IntArray,
     Landmarks,
     landmark_id_of,
+    traits_of,
 )
 
 WINDOW = 12
@@ -252,14 +253,15 @@ class _Traits(NamedTuple):
     def of(cls, found: Associated, recording: AnyRecording, living: LivingMap, settings: SlamConfig) -> Self | None:
         """Return what the columns of a recording say; None if that is nothing, or the map does not know them."""
         seen, row = recording.detections, found.landmark_row
-        if seen.features is None or not len(living.traits):
+        features, names = traits_of(seen)
+        if features is None or not len(living.traits):
             return None
         visit, landmark = visits_of(recording.frames.stamp_s[seen.frame], row, settings.association.forget_s)
-        traits = learned(seen.features, visit, landmark, settings=settings)
+        traits = learned(features, visit, landmark, settings=settings)
         if traits is None:
             return None
         mine = traits.of_landmarks(traits.of_visits(visit, len(landmark)), landmark, len(found.sightings))
-        columns = [seen.feature_names[c] for c in traits.column]
+        columns = [names[c] for c in traits.column]
         value, sessions = living.traits.of(living.members.landmark_id, columns)
         error = traits.errors[traits.most_readings] / np.maximum(sessions, 1)
         readings = (traits.most_readings * sessions.max(axis=1, initial=0)).astype(np.float64)

@@ -61,6 +61,7 @@ from evermap.types import (
     VerdictKind,
     is_in_space,
     rows_of,
+    traits_of,
 )
 from evermap.valid import OVERLAP_S, check_type, has_own_clock
 
@@ -416,12 +417,13 @@ def brought_in(
 def with_traits(living: LivingMap, recording: AnyRecording) -> LivingMap:
     """Return a map with what a session's detections say of what its landmarks are like."""
     seen = recording.detections
-    if seen.features is None:
+    features, columns = traits_of(seen)
+    if features is None:
         return living
     names, row = np.unique(seen.landmark_id, return_inverse=True)
-    value, _ = medians(seen.features, row, len(names))
+    value, _ = medians(features, row, len(names))
     known = np.isin(names, living.members.landmark_id)
-    return replace(living, traits=living.traits.met(names[known], seen.feature_names, value[known]))
+    return replace(living, traits=living.traits.met(names[known], columns, value[known]))
 
 
 def solved(

@@ -31,7 +31,7 @@ from evermap.slam.method import Static
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import StreamingSlam
-from evermap.types import UNKNOWN, AssociationEvidence, FloatArray, IntArray, Recording
+from evermap.types import UNKNOWN, AssociationEvidence, FloatArray, IntArray, Recording, traits_of
 
 _Found: TypeAlias = tuple[PlanarAssociator, Assignment]
 
@@ -126,8 +126,9 @@ def associated(
         return first, assignment
 
     best = found(None)
-    if given.features is not None:
-        best = with_traits(best, given.features[prepared.used], settings, found)
+    features, _ = traits_of(given)
+    if features is not None:
+        best = with_traits(best, features[prepared.used], settings, found)
     associator, assignment = best
     assignment, evidence = weighed_against_odometry(associator, assignment)
     row = np.full(len(given), NOBODY, dtype=np.int64)

@@ -52,7 +52,7 @@ from evermap.slam.space.intake import SpatialIntake, prepare_space, without_rang
 from evermap.slam.space.linearise import POINT, POSE
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem, Swing
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
-from evermap.types import UNKNOWN, AssociationEvidence, BoolArray, FloatArray, IntArray, SpatialRecording
+from evermap.types import UNKNOWN, AssociationEvidence, BoolArray, FloatArray, IntArray, SpatialRecording, traits_of
 
 FAR_M = 1e3
 """Standard deviation of the position of a landmark before its first detection: uninformative."""
@@ -90,10 +90,11 @@ def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, ke
         return associator, associator.finish()
 
     associator, solved = found(None)
-    if given.features is not None:  # all are judged by the noise and the density of the first one
+    features, _ = traits_of(given)
+    if features is not None:  # all are judged by the noise and the density of the first one
         first = SpatialAssociator(intake, kind, settings, known=solved), solved
         again = functools.partial(found, known=solved)
-        associator, solved = with_traits(first, given.features[intake.used], settings, again)
+        associator, solved = with_traits(first, features[intake.used], settings, again)
     row[intake.used], local, together, loose = associator.concluded(solved)
     of_kind = labels_of(kind, row[intake.used], len(local.place))
     loose = loose._replace(row=intake.used[loose.row])

@@ -7,7 +7,7 @@ nothing but the robot moves, and all else is the same: what it sees is worth wha
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from evermap.geometry import se3
 from evermap.geometry.group import accumulate
 from evermap.slam.plane import in_its_space
 from evermap.types import (
+    MASK_ID,
     UNKNOWN,
     BoolArray,
     FloatArray,
@@ -64,6 +65,10 @@ class YardConfig:
         oriented: whether tags are seen with their orientation; else as points.
         stated: whether `Recording.objects` says which tags are on one forklift.
         boxed: whether a detector reports boxes around forklifts, without identity.
+        masked: which numbers the masks of forklifts have: those of a tracker ('tracked'), or of each 'image'; None
+            where there are no masks.
+        walls_masked: whether the walls are a mask, too.
+        wrong_masks: share of the looks at a tag in which it is taken to lie where another one in view does.
         drive_s: how long a drive takes.
         reach_m, half_view_rad: how far the robot sees, and to either side.
         sigma_m, sigma_share, sigma_rad: noise of a tag's position at no range and as a share of it, and of its
@@ -83,6 +88,9 @@ class YardConfig:
     oriented: bool = True
     stated: bool = True
     boxed: bool = False
+    masked: Literal["tracked", "image"] | None = None
+    walls_masked: bool = False
+    wrong_masks: float = 0.05
     drive_s: float = 90.0
     reach_m: float = 10.0
     half_view_rad: float = 1.3
@@ -151,6 +159,8 @@ def simulate_yard(config: YardConfig | None = None, seed: int = 0) -> list[YardD
         recording = _record(tag, body_of_tag, body, config, start_s, np.random.default_rng([seed, 2, k]))
         if config.boxed:
             recording = _with_boxes(recording, body, config, np.random.default_rng([seed, 4, k]))
+        if config.masked is not None:
+            recording = _with_masks(recording, body_of_tag, config, np.random.default_rng([seed, 5, k]))
         drives.append(YardDrive(recording, body, moves, tag, body_of_tag))
     return drives
 
@@ -345,6 +355,24 @@ def _with_boxes(
         if isinstance(getattr(boxes, column.name), np.ndarray)
     }
     return replace(recording, detections=replace(given, **both), class_names=("tag", "forklift"))
+
+
+def _with_masks(
+    recording: SpatialRecording, body_of_tag: IntArray, config: YardConfig, rng: np.random.Generator
+) -> SpatialRecording:
+    """The recording with the number of the mask that each tag lies in, nan for none."""
+    seen = recording.detections
+    named = np.flatnonzero(seen.landmark_id != UNKNOWN)
+    thing, frame = body_of_tag[seen.landmark_id[named]], seen.frame[named]
+    first, last = np.searchsorted(frame, frame), np.searchsorted(frame, frame, side="right")
+    other = thing[first + np.floor(rng.uniform(size=len(frame)) * (last - first)).astype(np.int64)]
+    thing = np.where(rng.uniform(size=len(frame)) < config.wrong_masks, other, thing)
+    number = np.tile(np.arange(thing.max() + 2), (len(recording.frames), 1))
+    if config.masked == "image":
+        number = rng.permuted(number, axis=1)
+    mask = np.full((len(seen), 1), np.nan)
+    mask[named, 0] = np.where((thing < 0) & (not config.walls_masked), np.nan, number[frame, thing])
+    return replace(recording, detections=replace(seen, features=mask, feature_names=(MASK_ID,)))
 
 
 def _in_view(eye: FloatArray, tag: FloatArray, body: FloatArray, people: FloatArray, config: YardConfig) -> BoolArray:
