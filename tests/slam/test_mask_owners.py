@@ -12,7 +12,7 @@ from benchmarks.yard import error_m, is_true
 
 import evermap as em
 from evermap.config import Config
-from evermap.slam.association import with_identities
+from evermap.slam.association import identify, with_identities
 from evermap.slam.co_motion import Reckoned
 from evermap.slam.mask_owners import is_scenery, see_masks
 from evermap.slam.ownership import (
@@ -25,7 +25,7 @@ from evermap.slam.ownership import (
     find_owned,
     with_owned,
 )
-from evermap.types import MASK_ID, UNKNOWN, AnyRecording, IntArray, masks_of, rows_of, traits_of
+from evermap.types import MASK_ID, UNKNOWN, AnyRecording, FloatArray, IntArray, masks_of, rows_of, traits_of
 from evermap_studies.worlds.yard import STEP_S, YardConfig, YardDrive, flatten, simulate_yard
 
 PARKED = YardConfig(moving=0, parked=6, stated=False, masked="image")
@@ -240,7 +240,7 @@ def test_what_is_around_is_no_body(apart_m: float, others: int, scenery: bool) -
     assert is_scenery(seen, np.zeros(len(seen.frame), dtype=np.int64), pairs) is scenery
 
 
-def test_masks_are_no_traits() -> None:
+def test_masks_are_no_traits(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = simulate_yard(replace(PARKED, drive_s=40.0), 0)[0]
     recording = flatten(drive.recording)
     walls = rows_of(recording.detections, drive.body_of_tag[recording.detections.landmark_id] == UNKNOWN)
@@ -258,5 +258,15 @@ def test_masks_are_no_traits() -> None:
     bare = replace(walls, features=None, feature_names=())
     assert np.isnan(masks_of(bare)).all()
     asked = Config(slam={"unknown_ids": True}).slam
+    columns = list[int]()
+
+    def count_columns(best: Any, features: FloatArray, *_: Any) -> Any:
+        columns.append(features.shape[1])
+        return best
+
+    monkeypatch.setattr(identify, "with_traits", count_columns)
     found = [with_identities(replace(recording, detections=one), asked).detections for one in (alone, bare)]
     np.testing.assert_array_equal(found[0].landmark_id, found[1].landmark_id)
+    assert not columns
+    with_identities(replace(recording, detections=both), asked)
+    assert columns == [1]
