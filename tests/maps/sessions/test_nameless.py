@@ -27,7 +27,7 @@ from evermap.runs.edits import rename_landmark
 from evermap.runs.sessions import enter_session
 from evermap.slam.association.assignment import density_of_unmet
 from evermap.slam.association.constellation import LocalMap
-from evermap.types import MASK_ID, UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, rows_of
+from evermap.types import MASK_ID, UNKNOWN, ChangeKind, IntArray, Landmarks, MapChange, Recording, is_in_space, rows_of
 from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
 
 from .buildings import FIXED, building, lived_through
@@ -294,6 +294,7 @@ def test_masks_are_not_kept_of_landmarks(lived: tuple[BuildingSimulation, list[S
     """A radius is; the mask that it was seen in is not of the landmark itself."""
     _, sessions = lived
     living, recording = sessions[0].living, sessions[0].recording
+    assert not is_in_space(recording)
     mask = np.ones((len(recording.detections), 1))
     masked = replace(recording.detections, features=mask, feature_names=(MASK_ID,))
     assert with_traits(living, replace(recording, detections=masked)) is living
