@@ -188,13 +188,25 @@ def test_a_radio_that_moved_has_no_bias(shift_m: tuple[float, float]) -> None:
     assert result.changes[0].probability > 0.9
 
 
-def test_a_radio_that_moves_in_the_middle_of_a_drive_is_where_its_ranges_are() -> None:
+@pytest.mark.parametrize(
+    ("seed", "name", "shift_m", "again_s"),
+    [
+        (5, 2, (-0.5, 0.6), 20.0),
+        (0, 6, (0.9, 0.0), 20.0),  # most ranges afterwards are outliers where it was
+        (0, 11, (0.9, 0.0), 26.2),  # unseen for 12 s, with few ranges in the window of the second visit
+        (4, 11, (0.0, -0.6), 20.0),  # and the first of them are as good for either place
+    ],
+)
+def test_a_radio_that_moves_in_the_middle_of_a_drive_is_where_its_ranges_are(
+    seed: int, name: int, shift_m: tuple[float, float], again_s: float
+) -> None:
     """Ranges from nearby are linear about where it is by then, not about where it was."""
-    world, at_s, name, shift_m = World(seed=5), 20.0, 2, (-0.5, 0.6)
+    world, at_s = World(seed=seed), 20.0
     before, after = radios(world), radios(replace(world, moved={name: shift_m}))
     seen, since = before.detections, after.detections
     stamp_s = before.frames.stamp_s
     kept, new = ((stamp_s[one.frame] < at_s) == early for one, early in ((seen, True), (since, False)))
+    new &= (since.landmark_id != name) | (stamp_s[since.frame] >= again_s)
     both = [np.concatenate([getattr(seen, key)[kept], getattr(since, key)[new]]) for key in READ]
     rows = np.zeros(len(both[0]), dtype=np.int64)
     moves = replace(before, detections=replace(seen[rows], **dict(zip(READ, both, strict=True))))
@@ -202,10 +214,13 @@ def test_a_radio_that_moves_in_the_middle_of_a_drive_is_where_its_ranges_are() -
     (change,) = result.changes
     assert change.landmark_ids == (name,)
     assert change.displacement_m == pytest.approx(shift_m, abs=0.03)
-    assert change.stamp_from_s - 2.0 < at_s < change.stamp_to_s + 2.0
-    assert change.stamp_to_s - change.stamp_from_s < 5.0
+    mine_s = stamp_s[moves.detections.frame[moves.detections.landmark_id == name]]
+    assert mine_s[mine_s < at_s].max() - 2.0 < change.stamp_from_s < at_s
+    assert at_s <= change.stamp_to_s < mine_s[mine_s >= at_s].min() + 2.0
     assert change.probability > 0.99
     assert result.causes == ()
+    assert result.verdict is not None
+    assert result.verdict.kind == "sound"
 
 
 @pytest.mark.parametrize("mapped", [True, False])

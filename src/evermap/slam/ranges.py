@@ -164,7 +164,7 @@ def _fixes(ranged: Ranged, noise_m: float, offset_m: float, settings: RangesConf
             some = np.flatnonzero(np.abs(stamp_s - middle_s) <= half_s)
             whole = len(some) == len(stamp_s)
             some = some[np.linspace(0, len(some) - 1, min(len(some), settings.most_ranges)).astype(np.int64)]
-            fix = _fix(Ranged(*(column[some] for column in ranged)), noise_m, offset_m, settings)
+            fix = locate_by_ranges(Ranged(*(column[some] for column in ranged)), noise_m, offset_m, settings)
             if fix is None and whole:  # all together do not tell: nor will they around another moment
                 return found
             half_s *= 2.0
@@ -172,8 +172,8 @@ def _fixes(ranged: Ranged, noise_m: float, offset_m: float, settings: RangesConf
     return found
 
 
-def _fix(ranged: Ranged, noise_m: float, offset_m: float, settings: RangesConfig) -> Fix | None:
-    """Return where a landmark is by some ranges; None where they do not tell."""
+def locate_by_ranges(ranged: Ranged, noise_m: float, offset_m: float, settings: RangesConfig) -> Fix | None:
+    """Return where a landmark is by some ranges, which may share an offset of so much; None where they do not tell."""
     if len(ranged.range_m) < settings.fewest:
         return None
     way_m = float(np.median(ranged.way_m))

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dense import DensePosterior
-from problems import World, default_prior, make_world
+from problems import World, default_prior, make_world, slow_detection
 from references import log_group_prior, log_normal, random_covariance, static_evidence
 from test_gain import gain_of
 
-from evermap.config import ChangesConfig
+from evermap.config import ChangesConfig, RangesConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.slam.calibration import AHEAD, ASIDE, FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
@@ -20,11 +20,23 @@ from evermap.types import ANY_BEARING_RAD
 
 KNOWN_SIZE = default_prior(range_slope=0.0)
 """With the range slope given, lengths are what the sensor says: nothing to divide."""
+RANGES = RangesConfig()
 
 
 def evidence_of(world: World, bounds: list[int], estimate: Estimate | None = None) -> WindowEvidence:
     estimate = world.truth if estimate is None else estimate
-    return exhausted(landmark_evidence(world.problem, estimate, world.noise, world.problem.prior, np.array(bounds), 3))
+    problem = world.problem
+    return exhausted(landmark_evidence(problem, estimate, world.noise, problem.prior, np.array(bounds), 3, RANGES))
+
+
+def with_move(world: World, name: int, shift_m: tuple[float, float], since: int) -> World:
+    """The world where a landmark is elsewhere from a pose on, and is read there without noise."""
+    problem, truth = world.problem, world.truth
+    gone = (problem.landmark_row == name) & (problem.pose_row >= since)
+    place, reading = truth.landmark[name] + shift_m, problem.reading.copy()
+    poses = truth.pose[problem.pose_row[gone]]
+    reading[gone] = slow_detection(poses, np.tile(place, (len(poses), 1)), truth.states, problem.mount)
+    return replace(world, problem=replace(problem, reading=reading))
 
 
 def problem_of_copies(problem: Problem, evidence: WindowEvidence, bounds: list[int]) -> Problem:
@@ -94,14 +106,31 @@ def test_ranges_of_what_moved_are_linear_where_it_is_by_then() -> None:
     world = make_world(4, n_poses=24, n_landmarks=5, p_seen=1.0, turn_radps=0.2)
     sigma = np.full((len(world.problem.reading), 2), np.nan)
     sigma[:, 1] = ANY_BEARING_RAD
-    problem, bounds = replace(world.problem, sigma_given=sigma), np.array([0, 8, 16, 24])
+    problem, bounds = with_move(world, 2, (0.7, -0.4), 8).problem, np.array([0, 8, 16, 24])
+    problem = replace(problem, sigma_given=sigma)
     moved = replace(world.truth, landmark=np.vstack([world.truth.landmark, world.truth.landmark[2] + [0.7, -0.4]]))
     row = np.array([[0, 1, 2, 3, 4], [0, 1, 5, 3, 4], [0, 1, 5, 3, 4]])
-    evidence = exhausted(landmark_evidence(problem, moved, world.noise, problem.prior, bounds, 3, row=row))
+    evidence = exhausted(landmark_evidence(problem, moved, world.noise, problem.prior, bounds, 3, RANGES, row=row))
     at = evidence.position - evidence.position[0]
     expected = moved.landmark[row[evidence.window, evidence.landmark]]
     scale = np.linalg.norm(at[1]) / np.linalg.norm(expected[1] - expected[0])  # of all by the prior of the metre
     np.testing.assert_allclose(at, scale * (expected - expected[0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("shift_m", [(0.9, 0.0), (-0.5, 0.6)])
+def test_ranges_locate_what_moved_though_nothing_says_that_it_did(shift_m: tuple[float, float]) -> None:
+    """Where it was, its later ranges are outliers: evidence from there would know nothing of it."""
+    world = make_world(4, n_poses=30, n_landmarks=5, prior=KNOWN_SIZE, noisy=0.0, p_seen=1.0, turn_radps=0.2)
+    sigma = np.full((len(world.problem.reading), 2), np.nan)
+    sigma[:, 1] = ANY_BEARING_RAD
+    moves = with_move(replace(world, problem=replace(world.problem, sigma_given=sigma)), 2, shift_m, 15)
+    evidence = evidence_of(moves, [0, 15, 30])
+    (row,) = np.flatnonzero((evidence.landmark == 2) & (evidence.window == 1))
+    np.testing.assert_allclose(evidence.position[row], world.truth.landmark[2] + shift_m, atol=0.02)
+    own = evidence.information[2 * row : 2 * row + 2, 2 * row : 2 * row + 2]
+    assert np.linalg.eigvalsh(own)[0] > 1.0 / 0.1**2
+    others = np.arange(len(evidence.landmark)) != row  # whose ranges agree with where they are
+    np.testing.assert_array_equal(evidence.position[others], world.truth.landmark[evidence.landmark[others]])
 
 
 def test_windows_with_tied_copies_are_one_window() -> None:

@@ -9,7 +9,7 @@ import pytest
 from references import static_evidence
 from worlds import Move, make_session
 
-from evermap.config import ChangesConfig
+from evermap.config import ChangesConfig, RangesConfig
 from evermap.estimate.sparse.system import exhausted
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
@@ -136,7 +136,9 @@ def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
         )
         estimate = Smoother(free, world.noise).optimum(world.truth)
         bounds = np.linspace(0, 200, n_windows + 1).astype(int)
-        evidence = exhausted(landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, 3))
+        evidence = exhausted(
+            landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, 3, RangesConfig())
+        )
         comparison = compare(evidence, given.mean, given.covariance, given.given)
         misfit += comparison.misfit
         freedom += comparison.freedom

@@ -16,12 +16,14 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
+from evermap.config import RangesConfig
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.batch import middles, sighted_at
-from evermap.slam.calibration import SLOPE, CalibrationPrior
+from evermap.slam.calibration import SLOPE, CalibrationPrior, seated
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.ranges import Ranged, locate_by_ranges
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -137,6 +139,7 @@ def landmark_evidence(
     prior: CalibrationPrior,
     bounds: IntArray,
     fewest: int,
+    ranges: RangesConfig,
     *,
     sized: bool = True,
     row: IntArray | None = None,
@@ -146,7 +149,8 @@ def landmark_evidence(
     The problem's priors of start and landmarks are left out; every landmark that was seen has a position in the
     estimate, and `prior` is of the calibration as the user means it. Windows begin at the poses `bounds` (W + 1,), of
     which the last is the number of poses. A copy takes the `fewest` sightings at least: one or two may be wrong
-    identities. If `sized`, range slope and size are divided by their priors; else positions stay in the metres of the
+    identities. What is seen by `ranges` alone, most of which disagree with its place, is where those of the window
+    locate it. If `sized`, range slope and size are divided by their priors; else positions stay in the metres of the
     sensor, which is enough where there is no map to compare with. If some have moved, `row` (W, L) are the places of
     the estimate at which landmarks are in each window.
     """
@@ -156,7 +160,7 @@ def landmark_evidence(
     pieces: list[_Piece] = []
     for w in range(n_windows):
         here = estimate if row is None else replace(estimate, landmark=estimate.landmark[row[w]])
-        piece = yield from _piece(problem, here, noise, held, (bounds[w], bounds[w + 1], fewest))
+        piece = yield from _piece(problem, here, noise, held, (bounds[w], bounds[w + 1], fewest), ranges)
         pieces.append(piece)
     information, right, at_pose = _joined(pieces)
     yield dense_ms(len(right))
@@ -267,7 +271,12 @@ class _Piece(NamedTuple):
 
 
 def _piece(
-    problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, window: tuple[int, int, int]
+    problem: Problem,
+    estimate: Estimate,
+    noise: Noise,
+    prior: CalibrationPrior,
+    window: tuple[int, int, int],
+    ranges: RangesConfig,
 ) -> Slices[_Piece]:
     start, stop, fewest = window
     last = min(stop + 1, len(problem.stamp_s))
@@ -296,10 +305,38 @@ def _piece(
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
     yield MS_OF_DETECTION * len(used)
-    information, right = yield from Smoother(part, noise).information_in_slices(local, ends[::-1])
+    smoother = Smoother(part, noise)
+    if ranged.any():
+        local = _where_ranges_agree(smoother, local, ranged, sighted, ranges)
+        position = local.landmark
+    information, right = yield from smoother.information_in_slices(local, ends[::-1])
     if len(ends) == 1:  # a window of one pose: it is the first and there is no other
         information, right = np.pad(information, ((3, 0), (3, 0))), np.pad(right, (3, 0))
     return _Piece(landmark, position, information, right)
+
+
+def _where_ranges_agree(
+    smoother: Smoother, estimate: Estimate, ranged: BoolArray, sighted: FloatArray, ranges: RangesConfig
+) -> Estimate:
+    """Move what is `ranged` (L,) to where its ranges locate it, if most of them are outliers where it is.
+
+    Outliers have no information, so that evidence there would not show that it moved. Detections point to `sighted`
+    (M, 2), of which the distance from the sensor counts.
+    """
+    part, position = smoother.problem, estimate.landmark.copy()
+    weights = smoother.inlier_probability(estimate)
+    eye = se2.compose(estimate.pose, seated(part.mount, estimate.states))[part.pose_row, :2]
+    range_m, sigma_m = np.linalg.norm(sighted - eye, axis=1), part.find_sigma(smoother.noise)[:, 0]
+    for k in np.flatnonzero(ranged):
+        mine = np.flatnonzero(part.landmark_row == k)
+        if np.count_nonzero(weights[mine] > 0.5) >= 0.5 * len(mine):
+            continue
+        noise_m = float(np.median(sigma_m[mine]))
+        still = np.zeros(len(mine))  # poses are known better than odometry alone knows them
+        fix = locate_by_ranges(Ranged(eye[mine], still, still, range_m[mine]), noise_m, noise_m, ranges)
+        if fix is not None:
+            position[k] = fix.place
+    return replace(estimate, landmark=position)
 
 
 def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:

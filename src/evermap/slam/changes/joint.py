@@ -40,6 +40,8 @@ from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 VISIT_MARGIN, MOST_VISITS = 0.5, 8
 """Visits that get windows of their own: this share of the interval around it, and this many."""
 DISAGREES = "the prior map disagrees with the detections, and no change explains it: cannot localise in it"
+WINDOWS_AROUND = 2
+"""Windows with its sightings on either side of a change in which its instant is sought, at most."""
 ROUNDS = 6
 """Searches at the end of a session, at most."""
 POSES_A_WINDOW, MOST_WINDOWS, MOST_ITEMS = 60, 12, 400
@@ -65,6 +67,7 @@ class Joint(Method):
     ) -> None:
         self._count, self._calibration, self._given = n_landmarks, calibration, given
         self._prior, self._robust, self._fewest = settings.changes, settings.robust, settings.fewest_sightings
+        self._ranges = settings.ranges
         self._loosened: _Loosened | None = None
         self._concluded: Explanation | None = None
         self._landmark = np.arange(n_landmarks)
@@ -144,7 +147,7 @@ class Joint(Method):
             bounds = self._bounds(base)
             row = self._rows_by_window(estimate, base.stamp_s[bounds[:-1]])
             evidence = yield from landmark_evidence(
-                base, estimate, noise, self._calibration, bounds, self._fewest, sized=in_map, row=row
+                base, estimate, noise, self._calibration, bounds, self._fewest, self._ranges, sized=in_map, row=row
             )
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
@@ -319,14 +322,16 @@ class Joint(Method):
         """
         if group.window == 0:
             return group
-        seen = evidence.window[np.isin(evidence.landmark, group.members)]
-        first = seen[seen < group.window].max()
-        last = seen[seen >= group.window].min(initial=len(bounds) - 2)
+        seen = np.unique(evidence.window[np.isin(evidence.landmark, group.members)])
+        # a window more on both sides: of a few ranges, one may say nothing of which place they are of
+        first = seen[seen < group.window][-WINDOWS_AROUND:][0]
+        later = seen[seen >= group.window][:WINDOWS_AROUND]
+        last = later[-1] if len(later) else len(bounds) - 2
         stamps = base.stamp_s[np.minimum(bounds[[first, group.window, last + 1]], len(base.stamp_s) - 1)]
         within_s = (float(stamps[0]), float(stamps[2]))
-        solved = any(g.since_s == stamps[1] and np.array_equal(g.members, group.members) for g in self._groups)
-        if not solved:  # the poses are those of another time, and would vote for it
-            return replace(group, since_s=float(stamps[1]), between_s=within_s)
+        begun = replace(group, since_s=float(stamps[1]), between_s=within_s)
+        if not any(begun.same_as(solved) for solved in self._groups):  # poses of another time would vote for it
+            return begun
         old = estimate.landmark[: self._count]
         free = yield from unswayed(base, estimate, noise, group.members)
         since_s, between_s = parting_time(
