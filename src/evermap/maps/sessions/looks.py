@@ -42,7 +42,7 @@ LOGITS = np.linspace(-60.0, 20.0, 801)
 FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
 positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
-LEAST_GONE = 1e-3
+LEAST_P = 1e-3
 """Probability that something is gone which the session saw."""
 SHARES = np.geomspace(0.25, 64.0, 25)
 """Parameters of the beta distribution of that share which are weighed, all alike (both are a number of positions)."""
@@ -315,7 +315,7 @@ def _through_space(
     space = weigh_new_lines(
         Rays(*ends(seen), rows.clique[seen]),
         NewLooks(clique, rows.key[asked], hit, nominal[asked], *ends(asked)),
-        np.where(stands, LEAST_GONE, p_gone),
+        np.where(stands, LEAST_P, p_gone),
         ~elsewhere & (shown | stands | unlooked),
         before,
         lines.rules.clear,
