@@ -166,9 +166,11 @@ def _around(living: LivingMap, glances: Sequence[_Glance], sensor: Sensor, confi
 
 def warm_up(config: Config) -> None:
     """Compile what a step needs, or load it."""
+    from evermap.maps.sessions import open_space
     from evermap.slam import localize_recording, warmup
 
     localize_recording.warm_up()
+    open_space.warm_up()
     warmup.warm_up(search=False)
     marks = Landmarks.at([0, 1, 2], [[2.0, 0.0], [2.0, 1.0], [9.0, 9.0]], sigma_m=0.1)
     living = LivingMap.begun(marks).from_now_on(0.0)

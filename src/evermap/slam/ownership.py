@@ -31,6 +31,7 @@ from evermap.slam.mask_owners import is_scenery, see_masks
 from evermap.slam.space.box_owners import Sights, see_boxes
 from evermap.slam.space.moving import has_traffic
 from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, is_in_space, masks_of
+from evermap.valid import validate
 
 PRIOR = 0.2
 """Probability that a landmark in view is on a body that is, too."""
@@ -76,7 +77,11 @@ def with_owned(recording: AnyRecording, config: Config) -> tuple[Any, tuple[str,
     Args:
         recording: as read.
         config: settings.
+
+    Raises:
+        InputError: values that cannot be.
     """
+    validate(recording)
     if config.slam.unknown_ids is True:
         return recording, ()
     owned = find_owned(recording, config)

@@ -146,6 +146,14 @@ def weigh_new_lines(
     )
 
 
+def warm_up() -> None:
+    """Compile what new lines need, or load it."""
+    from evermap.sensing.kernels import unseen_length
+
+    eye, place, body = np.zeros((1, 2)), np.ones((1, 2)), np.zeros(1, dtype=np.int64)
+    unseen_length(eye, place, body, eye, place, body, (WIDE_M, NARROW_M, STEP_M))
+
+
 def _evenly(of: IntArray, n: int, most: int) -> BoolArray:
     """Return which lines (K,) to cliques are taken, `most` of each, evenly."""
     order = np.argsort(of, kind="stable")

@@ -160,7 +160,7 @@ def landmark_evidence(
     pieces: list[_Piece] = []
     for w in range(n_windows):
         here = estimate if row is None else replace(estimate, landmark=estimate.landmark[row[w]])
-        piece = yield from _piece(problem, here, noise, held, (bounds[w], bounds[w + 1], fewest), ranges)
+        piece = yield from _piece(problem, here, noise, held, (bounds[w], bounds[w + 1], fewest), ranges, sized=sized)
         pieces.append(piece)
     information, right, at_pose = _joined(pieces)
     yield dense_ms(len(right))
@@ -277,6 +277,8 @@ def _piece(
     prior: CalibrationPrior,
     window: tuple[int, int, int],
     ranges: RangesConfig,
+    *,
+    sized: bool,
 ) -> Slices[_Piece]:
     start, stop, fewest = window
     last = min(stop + 1, len(problem.stamp_s))
@@ -299,8 +301,9 @@ def _piece(
     )
     sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
     position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
-    # ranges alone are linear near where it is only; one bearing of a landmark is a first value (`slam.ranges`)
-    ranged = np.bincount(part.landmark_row, part.has_bearing, minlength=count) <= 1
+    # ranges alone are linear near where it is only. One bearing of a landmark is a first value (`slam.ranges`), which a
+    # map knows better; without one the estimate is no better than that
+    ranged = np.bincount(part.landmark_row, part.has_bearing, minlength=count) <= (1 if sized else 0)
     position[ranged] = estimate.landmark[landmark[ranged]]
     local = Estimate(estimate.pose[start:last], position, estimate.states)
     ends = np.unique([0, last - start - 1])
