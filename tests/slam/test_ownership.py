@@ -11,7 +11,7 @@ from benchmarks.yard import error_m, is_true
 import evermap as em
 from evermap.config import Config
 from evermap.geometry import se3
-from evermap.slam.co_motion import find_movers, pair_movers
+from evermap.slam.co_motion import Movers, find_movers, locate_by_odometry, pair_movers
 from evermap.slam.ownership import OWNED, PRIOR, find_links, find_owned, weigh_looks, with_owned
 from evermap.slam.space.box_owners import Sights, see_boxes
 from evermap.slam.space.moving import is_located
@@ -21,6 +21,13 @@ from evermap_studies.worlds.yard import YardConfig, YardDrive, simulate_yard
 UNSTATED = YardConfig(moving=6, parked=0, stated=False)
 USUAL = Config().slam.space.traffic
 BOXED = replace(UNSTATED, boxed=True)
+
+
+def movers_of(recording: SpatialRecording) -> Movers | None:
+    """What moves in view, by where the odometry has the sightings."""
+    seen = locate_by_odometry(recording, Config().slam.space)
+    assert seen is not None
+    return find_movers(seen, Config())
 
 
 def groups_of(drive: YardDrive, objects: IntArray) -> list[set[int]]:
@@ -92,7 +99,7 @@ def test_what_is_stated_stays_and_names_the_body() -> None:
 def test_what_moves_together_is_on_one_body(oriented: bool) -> None:
     for seed in (5, 6):
         drive = simulate_yard(replace(UNSTATED, oriented=oriented), seed)[0]
-        movers = find_movers(drive.recording, Config())
+        movers = movers_of(drive.recording)
         assert movers is not None
         assert (drive.body_of_tag[movers.landmark_id] >= 0).all()
         assert drive.moves[drive.body_of_tag[movers.seen.landmark_id], movers.seen.frame][movers.moves].mean() > 0.9
@@ -106,7 +113,7 @@ def test_what_moves_together_is_on_one_body(oriented: bool) -> None:
 
 def test_nothing_moves_where_the_robot_alone_does() -> None:
     drive = simulate_yard(replace(UNSTATED, standing=True), 1)[0]
-    assert find_movers(drive.recording, Config()) is None
+    assert movers_of(drive.recording) is None
     found, remarks = with_owned(drive.recording, Config())
     assert found is drive.recording
     assert remarks == ()
@@ -126,7 +133,7 @@ def test_an_odometry_that_errs_moves_no_landmark() -> None:
     for one in step:
         pose.append(se3.compose(pose[-1], one))
     wrong = replace(drive.recording, odometry=replace(odometry, pose_world_robot=np.array(pose)))
-    assert find_movers(wrong, Config()) is None
+    assert movers_of(wrong) is None
 
 
 def test_a_wall_behind_a_parked_forklift_is_not_owned_once_it_drives_off() -> None:

@@ -131,10 +131,10 @@ def locate_by_odometry(recording: AnyRecording, settings: SpaceConfig) -> Reckon
     return Reckoned(seen.landmark_id[rows], stamp_s[rows], seen.frame[rows], rows, at, sigma_m, own, noise_m, turn)
 
 
-def find_movers(recording: AnyRecording, config: Config) -> Movers | None:
-    """Return landmarks that move in view; None where there are none, or no odometry."""
-    found, still = locate_by_odometry(recording, config.slam.space), config.track.still
-    if found is None or not len(found.stamp_s):
+def find_movers(found: Reckoned, config: Config) -> Movers | None:
+    """Return landmarks that move in view, by all sightings of a recording; None where there are none."""
+    still = config.track.still
+    if not len(found.stamp_s):
         return None
     earlier, later = _pair_looks(found)
     if not len(earlier):

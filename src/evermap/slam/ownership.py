@@ -106,7 +106,8 @@ def find_owned(recording: AnyRecording, config: Config) -> Ownership:
     found = list[Links]()
     if has_traffic(recording):
         found.append(find_links(see_boxes(recording, config)))
-    movers, seen = find_movers(recording, config), locate_by_odometry(recording, config.slam.space)
+    seen = locate_by_odometry(recording, config.slam.space)
+    movers = None if seen is None else find_movers(seen, config)
     pairs, p = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     if movers is not None:
         pairs, p = pair_movers(movers, PRIOR, config.track.still)

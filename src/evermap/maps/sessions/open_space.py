@@ -136,14 +136,12 @@ def weigh_new_lines(
     total = prior + fit[teaches[who]].sum(axis=0)
     p_clear, p_line = np.zeros(n), np.zeros(len(first))
     for k in np.flatnonzero(~seen):  # its own miss is the evidence on it, and counts once
-        weight = _normalised(total - fit[k] * teaches[who[k]])
+        weight = _normalise(total - fit[k] * teaches[who[k]])
         p_clear[who[k]] = 1.0 - float((weight * is_hidden[k]).sum())
         mine = asked[of[asked] == who[k]]
         p_line[mine] = np.exp(-u[mine, None] * RATES) @ weight.sum(axis=0)
     counts = (p_line >= least_clear)[key] & (p_clear >= least_clear)[looks.clique]
-    return OpenSpace(
-        counts, p_clear, unseen_m, _moments(_normalised(total), settings) if teaches[who].any() else before
-    )
+    return OpenSpace(counts, p_clear, unseen_m, _moments(_normalise(total), settings) if teaches[who].any() else before)
 
 
 def warm_up() -> None:
@@ -189,7 +187,7 @@ def _fit_lines(looks: NewLooks, key: IntArray, of: IntArray, asked: IntArray, u:
     return total / np.maximum(np.bincount(of, minlength=n), 1)[:, None]
 
 
-def _normalised(log_weight: FloatArray) -> FloatArray:
+def _normalise(log_weight: FloatArray) -> FloatArray:
     weight = np.exp(log_weight - log_weight.max())
     return np.asarray(weight / weight.sum())
 

@@ -310,7 +310,7 @@ def _piece(
     yield MS_OF_DETECTION * len(used)
     smoother = Smoother(part, noise)
     if ranged.any():
-        local = _where_ranges_agree(smoother, local, ranged, sighted, ranges)
+        local = _move_to_ranges(smoother, local, ranged, sighted, ranges)
         position = local.landmark
     information, right = yield from smoother.information_in_slices(local, ends[::-1])
     if len(ends) == 1:  # a window of one pose: it is the first and there is no other
@@ -318,7 +318,7 @@ def _piece(
     return _Piece(landmark, position, information, right)
 
 
-def _where_ranges_agree(
+def _move_to_ranges(
     smoother: Smoother, estimate: Estimate, ranged: BoolArray, sighted: FloatArray, ranges: RangesConfig
 ) -> Estimate:
     """Move what is `ranged` (L,) to where its ranges locate it, if most of them are outliers where it is.

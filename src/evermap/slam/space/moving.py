@@ -184,7 +184,7 @@ def _taken_beside_landmarks(
     if (identity != UNKNOWN).any():
         beside = prepare_space(replace(recording, detections=seen), space, fewest=0)
         at_rest = _share_alike(beside.problem, track.still)
-        intake = _joined(named, replace(beside, problem=at_rest))
+        intake = _join_boxes(named, replace(beside, problem=at_rest))
     seen = replace(seen, landmark_id=np.where(identity == UNKNOWN, given.landmark_id, identity))
     standing = replace(recording, detections=seen, warnings=())
     everything = np.arange(len(given))
@@ -200,7 +200,7 @@ def _share_alike(problem: SpatialProblem, settings: StillConfig) -> SpatialProbl
     return replace(problem, share=share)
 
 
-def _joined(named: SpatialIntake, beside: SpatialIntake) -> SpatialIntake:
+def _join_boxes(named: SpatialIntake, beside: SpatialIntake) -> SpatialIntake:
     """The input of landmarks with static boxes behind them, of the same frames."""
     problem, order = _with_places_of(named.problem, beside.problem)
     count = len(beside.landmark_id)
