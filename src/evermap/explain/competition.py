@@ -179,7 +179,7 @@ def _next_cause(
         for trial in trials:
             if best is not None and not (ahead(trial) > lead(trial) and _relieves(trial, best, config)):
                 continue  # it fits better, as with any further state, but nothing that was asked is explained
-            if winner is None or trial.beats(winner) > 0.0:
+            if winner is None or trial.is_better(winner):
                 winner = trial
         if winner is not None and not find_symptoms(winner.solution.result, winner.inputs, config):
             return winner
@@ -295,7 +295,7 @@ def _ask_rivals(
         trial = solve_trial(rival.inputs, rival.taken, last.suspect, last.state, solve_under, budget)
         if trial is not None:
             weighed.append(trial)
-            best = trial if trial.beats(best) > 0.0 else best
+            best = trial if trial.is_better(best) else best
     return best
 
 
@@ -316,7 +316,7 @@ def _without_needless(
         except EvermapError:
             continue
         weighed.append(trial)
-        if trial.beats(best) > 0.0:
+        if trial.is_better(best):
             best = trial
     return best
 

@@ -36,6 +36,8 @@ INLIER, FEWER = 0.5, 0.7
 """Probability from which a detection is no outlier, and share of the outliers that a cause must leave at most."""
 OF_NOISE = "_noise_factor", "sigma_corner_px"
 """Ends of the names of noise levels."""
+ROUNDING = 1e-6
+"""Difference of log evidences that is rounding [nats]."""
 IGNORED, HEARD, IGNORED_NATS = 10.0, 3.0, 100.0
 """Noise over what is stated from which a sensor is ignored, up to which it is not, and what that is worth [nats]."""
 
@@ -103,6 +105,15 @@ class Trial(Generic[VisitT]):
         if max(self.noise, other.noise) > IGNORED and min(self.noise, other.noise) < HEARD:
             return (IGNORED_NATS if self.noise < other.noise else -IGNORED_NATS) + price
         return (self.evidence - other.evidence - price) * min(self.worth, other.worth) + price
+
+    def is_better(self, other: Trial[VisitT]) -> bool:
+        """Return whether the evidence is larger. Of two that explain all readings alike, as a map that is mirrored and
+        angles that are clockwise do, the one of the map counts: without it the session contradicts nothing.
+        """
+        lead = self.beats(other)
+        if abs(lead) > ROUNDING:
+            return lead > 0.0
+        return any(one.suspect.of_map for one in self.taken) and not any(one.suspect.of_map for one in other.taken)
 
     @cached_property
     def gain_left(self) -> float:
