@@ -153,16 +153,16 @@ def _leave_out_motion(case: _Case) -> _Case:
 
 
 def _conclude(case: _Case, **more: Any) -> tuple[SlamResult, SessionSolution[Visit]]:
-    """Return a case solved, with what exists, faults and verdict; and its solution; `more` is as of `explained`."""
+    """Return a case solved, what exists, faults and verdict; and its solution; `more` as of `explain_session`."""
     from evermap.explain.causes.suspect import Inputs
-    from evermap.maps.sessions import session
+    from evermap.maps.sessions import session, solve
     from evermap.slam.space.up import with_known_up
 
     config, prior_map = case.config, case.prior_map
     given = Inputs.of(case.recording, prior_map)
-    solution = session.explained(given, config, case.remarks, is_read_well=case.is_read_well, **more).best.solution
+    solution = solve.explain_session(given, config, case.remarks, is_read_well=case.is_read_well, **more).best.solution
     visit, asked = solution.visit, solution.asked
-    result = replace(session.existing(visit, solution.result, config.living), association=case.evidence)
+    result = replace(session.add_existence(visit, solution.result, config.living), association=case.evidence)
     if prior_map is not None:
         not_missed = [*case.doubled.tolist(), *case.left_out]  # what was read was not missed
         expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
@@ -269,12 +269,12 @@ def run_together(
         frames = ["first_pose", *["first_robot"] * (len(visits) - 1)]
         joint = spatial.solve_visits_together(visits, config.slam.localize)
         for number, one, frame in zip(recordings, joint, frames, strict=True):
-            result = session.existing(one, one.concluded(frame), config.living)
+            result = session.add_existence(one, one.concluded(frame), config.living)
             results[number] = with_verdict(result, one.recording, config.slam, findings=findings[number])
         return results
     for number, solved, online in zip(alone, *planar_together.solve_together(alone), strict=True):
         visit = planar.PlanarVisit(solved)
-        result = session.existing(visit, replace(visit.concluded(online.frame), online=online), config.living)
+        result = session.add_existence(visit, replace(visit.concluded(online.frame), online=online), config.living)
         results[number] = with_verdict(result, solved.recording, config.slam, findings=findings[number])
     return results
 
@@ -297,7 +297,7 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
-    from evermap.maps.sessions import boxes, nameless, planar, session
+    from evermap.maps.sessions import admission, boxes, nameless, planar, session, solve
     from evermap.slam import check
     from evermap.slam.ownership import with_owned
     from evermap.slam.space.moving import has_traffic
@@ -306,27 +306,27 @@ def run_session(
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
     stated = recording.objects
     recording, owned = with_owned(recording, config)
-    recording = session.with_overlap(session.in_its_space(recording, living, config), living)
-    living, whole = session.opened(living, recording), replace(recording, objects=stated)
+    recording = admission.with_overlap(admission.in_its_space(recording, living, config), living)
+    living, whole = admission.open_map(living, recording), replace(recording, objects=stated)
     located: Localised[PlanarVisit] | Localised[SpatialVisit]
     if is_in_space(recording):
         recording, remarks, found = check.screened(nameless.without_ids(recording, config), config)
         remarks = (*owned, *remarks)
-        session.check_static(recording, config)
-        recording, living = session.admitted(recording, living)
+        admission.check_static(recording, config)
+        recording, living = admission.admit(recording, living)
         if config.slam.unknown_ids:
-            recording, living = session.admitted(nameless.named_in(recording, living, config), living)
+            recording, living = admission.admit(nameless.named_in(recording, living, config), living)
         located = boxes.localised(recording, living, config, remarks, progress)
     else:
         alone = solve_alone(recording, living, config, progress=progress)
-        living, found = session.with_names_of(living, alone.recording), alone.findings
+        living, found = admission.with_names_of(living, alone.recording), alone.findings
         located = planar.localised(alone, living, config)
     found = (*riders, *found)
-    entered = session.with_causes(session.brought_in(located, living, config.living), living, config)
+    entered = solve.with_causes(session.bring_in(located, living, config.living), living, config)
     if has_traffic(whole):
-        return _add_verdict(session.begun_with(entered, whole), None, living, config, found)
+        return _add_verdict(session.with_start_of(entered, whole), None, living, config, found)
     judged = _judge_in_map(entered, located.visit, living, config, found)
-    return session.begun_with(judged, whole)
+    return session.with_start_of(judged, whole)
 
 
 @single_threaded()
@@ -335,14 +335,14 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
 
     It is the same for all maps that agree on classes and deleted landmarks, whatever else they believe.
     """
-    from evermap.maps.sessions import nameless, planar, session
+    from evermap.maps.sessions import admission, nameless, planar
     from evermap.slam import check, estimate
     from evermap.slam.moving_bodies import without_motion
 
     recording, remarks, found = check.screened(nameless.without_ids(recording, config), config, repair=True)
-    recording = session.admit_recording(recording, living)
+    recording = admission.admit_recording(recording, living)
     if config.slam.unknown_ids:
-        recording = session.admit_recording(nameless.named_in(recording, living, config), living)
+        recording = admission.admit_recording(nameless.named_in(recording, living, config), living)
     recording, moved = without_motion(recording, config)
     remarks = (*remarks, *moved)
     solved = estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
@@ -352,11 +352,11 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
 @single_threaded()
 def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     """Enter a session that was solved alone into a map: the second half of `run_session` in the plane."""
-    from evermap.maps.sessions import planar, session
+    from evermap.maps.sessions import admission, planar, session
 
-    living = session.with_names_of(living, alone.recording)
+    living = admission.with_names_of(living, alone.recording)
     located = planar.localised(alone, living, config)
-    entered = session.brought_in(located, living, config.living)
+    entered = session.bring_in(located, living, config.living)
     return _judge_in_map(entered, located.visit, living, config, alone.findings)
 
 
@@ -366,20 +366,20 @@ def _judge_in_map(
     """Return a session with its verdict; one that can't be trusted as it is without what causes other than changes did,
     where there are any: as `run_slam` solves a recording.
     """
-    from evermap.maps.sessions import session
+    from evermap.maps.sessions import session, solve
 
     judged = _add_verdict(entered, visit, before, config, found)
-    if not (config.slam.explain.on and entered.found and session.is_doubtful(judged)):
+    if not (config.slam.explain.on and entered.found and solve.is_doubtful(judged)):
         return judged
-    explained = session.find_causes(entered, before, config, is_suspected=_is_held(judged.slam))
+    explained = solve.find_causes(entered, before, config, is_suspected=_is_held(judged.slam))
     if explained is None or not explained.causes:
         return judged
     taken = explained.best.taken
     if taken and not any(one.suspect.of_map for one in taken):
         located = _localise(explained.best.inputs.recording, before, config)
-        again = session.brought_in(located, before, config.living)
+        again = session.bring_in(located, before, config.living)
         if again.found:
-            again = session.with_calibration(again, explained)
+            again = solve.with_calibration(again, explained)
             return _add_verdict(again, located.visit, before, config, found)
     named = replace(entered, slam=replace(entered.slam, causes=explained.causes))
     named = _add_verdict(named, visit, before, config, found)
@@ -406,13 +406,13 @@ def _add_verdict(
     """
     from evermap.explain.causes.suspect import Inputs
     from evermap.explain.scores import ScreenedSession
-    from evermap.maps.sessions import session
+    from evermap.maps.sessions import session, solve
 
     expected = before.landmarks(p_least=0.0) if len(before.places) else None
     reason = entered.set_aside[0] if entered.set_aside else ""
     asked = None
     if visit is not None and entered.found and config.slam.explain.on:
-        asked = ScreenedSession(session.solution_of(visit), Inputs.of(visit.recording, None))
+        asked = ScreenedSession(solve.solution_of(visit), Inputs.of(visit.recording, None))
     slam = _judge(entered.slam, entered.recording, config, expected, found, set_aside=reason, asked=asked)
     return session.without_doubted(replace(entered, slam=slam), before, config.living)
 
@@ -450,7 +450,7 @@ def run_localization(
     """
     from evermap.explain.verdict import with_verdict
     from evermap.maps import vicinity
-    from evermap.maps.sessions import believe, session, spatial
+    from evermap.maps.sessions import admission, believe, spatial
     from evermap.slam import check, intake
     from evermap.slam.localize_recording import localize, localize_in_space
     from evermap.slam.space.moving import has_traffic
@@ -458,11 +458,11 @@ def run_localization(
     config = config or Config()
     refuse_localization(living, config)
     recording, riders = check.leave_out_riders_in_space(recording, config.slam)
-    recording = check.valid(session.in_its_space(recording, living, config), config.sensor)  # type: ignore[type-var]
+    recording = check.valid(admission.in_its_space(recording, living, config), config.sensor)  # type: ignore[type-var]
     recording, others = check.leave_out_riders(recording, config.slam)
     riders = (*riders, *others)
     if is_in_space(recording):
-        recording, living = session.admitted(recording, living)
+        recording, living = admission.admit(recording, living)
         named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
         if has_traffic(recording):  # boxes at rest are told from those that move by what comes later
             p_site = believe.aged(living, config.living, start_s).p_here
@@ -474,7 +474,7 @@ def run_localization(
         result = with_verdict(result, recording, config.slam, living.landmarks(p_least=0.0), findings=found)
         return replace(result, warnings=(*(finding.message for finding in found), *result.warnings))
     found = (*riders, *check.odd(recording, config.slam))
-    recording, living = session.admitted(recording, living)
+    recording, living = admission.admit(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
     places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
     joint, believed = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)

@@ -11,7 +11,6 @@ import pytest
 from evermap import run_slam
 from evermap.config import SlamConfig
 from evermap.explain.faults import find_unseen_jumps
-from evermap.maps.sessions import session
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.calibration import DELAY
 from evermap.slam.estimate import Solved, solve
@@ -119,7 +118,7 @@ def test_a_late_sensor_costs_no_second_solution(monkeypatch: pytest.MonkeyPatch)
         made.append(recording)
         return solve(recording, *args, **more)
 
-    monkeypatch.setattr(session, "solve", counted)
+    monkeypatch.setattr("evermap.maps.sessions.solve.solve", counted)
     result = run_slam(record(0.2))
     assert [(one.code, one.subject) for one in result.causes] == [("clock", "sensor")]
     assert len(made) == 1

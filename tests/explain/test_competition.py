@@ -23,7 +23,7 @@ from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.geometry.se2 import transform as transform_plane
 from evermap.geometry.se3 import transform as transform_space
-from evermap.maps.sessions import session
+from evermap.maps.sessions import solve
 from evermap.maps.sessions.planar import PlanarVisit
 from evermap.maps.sessions.session import Visit
 from evermap.slam.clocks import find_delay
@@ -90,13 +90,13 @@ def test_nothing_is_asked_of_a_sound_drive(kind: str, mapped: bool) -> None:
 
 def test_a_cause_that_cannot_mend_innovations_is_not_solved_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Turns 4 % short earn their price there, but leave innovations wider than was asked for."""
-    world, count, solved = World(seed=8, turns=1.04), list[object](), session.solved
+    world, count, solved = World(seed=8, turns=1.04), list[object](), solve.solve_session
 
     def counted(*given: object, **named: object) -> object:
         count.append(given)
         return solved(*given, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(session, "solved", counted)
+    monkeypatch.setattr(solve, "solve_session", counted)
     config = Config.model_validate({"slam": {"explain": {"innovations": 0.01}}})
     assert run_slam(world.space(corners=True), config, prior_map=world.map_in_space()).causes == ()
     assert len(count) == 1
@@ -558,7 +558,7 @@ def test_mounts_that_are_turned_together_are_named() -> None:
 def test_a_step_that_rejects_detections_says_as_much_as_a_fine_one() -> None:
     """A mount turned by 6 mrad moves corners by many times their noise."""
     recording, survey = recorded(World(seed=1), "corners")
-    asked = session.explained(Inputs.of(recording, survey), without_causes(), ()).best.solution.asked
+    asked = solve.explain_session(Inputs.of(recording, survey), without_causes(), ()).best.solution.asked
     for suspect in list_suspects(asked.inputs, calibrations=True):
         if suspect.code == "mount":
             coarse, fine = (
@@ -573,8 +573,8 @@ def trial_under(inputs: Inputs, suspect: Suspect, state: float) -> tuple[Trial[V
     """A trial of one cause at a state, and what solves others."""
 
     def solve_under(given: Inputs) -> SessionSolution[Visit]:
-        visit = session.solved(given.recording, Config(), given.prior_map, ())
-        return SessionSolution(visit, ScreenedSession(session.solution_of(visit), given), visit.concluded())
+        visit = solve.solve_session(given.recording, Config(), given.prior_map, ())
+        return SessionSolution(visit, ScreenedSession(solve.solution_of(visit), given), visit.concluded())
 
     trial = solve_trial(inputs, (), suspect, state, solve_under, Budget(1))
     assert trial is not None

@@ -14,7 +14,7 @@ from evermap.explain.causes import list_suspects
 from evermap.explain.causes.suspect import Inputs
 from evermap.explain.evidence import residuals_of
 from evermap.explain.linearise import FINE_STEP, STEP, change_by, change_by_motion
-from evermap.maps.sessions import session
+from evermap.maps.sessions import solve
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import prepare
 from evermap.slam.smoother import Smoother
@@ -28,7 +28,7 @@ CONFIG = Config.model_validate({"slam": {"explain": {"on": False}}})
 def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised(*, in_map: bool) -> None:
     recording = World(seed=2).plane()
     given = recording.true_landmarks if in_map else None
-    screened = session.explained(Inputs.of(recording, given), CONFIG, ()).best.solution.asked
+    screened = solve.explain_session(Inputs.of(recording, given), CONFIG, ()).best.solution.asked
     solved, screen, inputs, asked = screened.session, screened.screen, screened.inputs, set()
     assert isinstance(solved, Solved)
     graph, state, problem = screen.optimum.graph, screen.optimum.state, solved.outcome.problem
@@ -54,7 +54,7 @@ def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised(*, in_
 
 
 def test_a_lens_changes_residuals_as_if_all_were_read_again() -> None:
-    screened = session.explained(Inputs.of(World(seed=2).space(corners=True), None), CONFIG, ()).best.solution.asked
+    screened = solve.explain_session(Inputs.of(World(seed=2).space(corners=True), None), CONFIG, ()).best.solution.asked
     solved, screen, inputs, asked = screened.session, screened.screen, screened.inputs, 0
     for suspect in list_suspects(inputs, calibrations=True):
         if suspect.code not in {"focal-length", "intrinsics", "distortion"}:
@@ -81,7 +81,7 @@ def test_noise_of_the_same_size_at_all_ranges_does_not_shrink_them() -> None:
     unstated = replace(seen, covariance_sensor_m2=np.full((len(seen), 3, 3), np.nan))
     sensors = tuple(replace(one, sigma_m=0.03) for one in recording.sensors)
     recording = replace(recording, detections=unstated, sensors=sensors)
-    screened = session.explained(Inputs.of(recording, None), CONFIG, ()).best.solution.asked
+    screened = solve.explain_session(Inputs.of(recording, None), CONFIG, ()).best.solution.asked
     solved, screen, inputs = screened.session, screened.screen, screened.inputs
     suspects = {one.code: one for one in list_suspects(inputs, calibrations=True)}
     ranges = change_by(solved, screen, inputs, suspects["range-scale"], FINE_STEP)

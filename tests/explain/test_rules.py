@@ -29,7 +29,7 @@ from evermap.explain.trial import (
     weigh_solution,
     with_information,
 )
-from evermap.maps.sessions import session
+from evermap.maps.sessions import solve
 from evermap.types import Cause, ChangeKind, MapChange
 
 from .worlds import World
@@ -354,7 +354,7 @@ def test_what_is_of_all_has_other_symptoms_than_the_distance_of_one(
 
 def test_evidence_is_that_at_levels_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     inputs, config = Inputs.of(World(seed=1, seconds=10.0).plane(), None), Config()
-    solution = session.explained(inputs, config, ()).best.solution
+    solution = solve.explain_session(inputs, config, ()).best.solution
     asked = solution.asked
     before = weigh_solution(solution, ()).evidence
     gained = weigh_levels(asked.session)

@@ -20,7 +20,7 @@ from evermap.explain.scores import DRIFT, SIGNIFICANT, CalibrationScore, Session
 from evermap.explain.symptoms import Signs, with_scores
 from evermap.explain.verdict import judge_signs
 from evermap.geometry import se3
-from evermap.maps.sessions import session
+from evermap.maps.sessions import solve
 from evermap.types import AnyRecording, Frames, Landmarks, Recording, SpatialRecording, VerdictKind
 
 from .worlds import World
@@ -29,7 +29,7 @@ from .worlds import World
 def scored(recording: AnyRecording, given: Landmarks | None) -> SessionScores:
     """Return what a session tells that is solved as given."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
-    solution = session.explained(Inputs.of(recording, given), config, ()).best.solution
+    solution = solve.explain_session(Inputs.of(recording, given), config, ()).best.solution
     result, asked = solution.result, solution.asked
     return score_session(asked, result.trajectory)
 

@@ -19,7 +19,7 @@ from evermap.explain.symptoms import Signs
 from evermap.explain.trial import Explained, SessionSolution, Taken, Trial
 from evermap.explain.verdict import judge_signs
 from evermap.geometry import se3
-from evermap.maps.sessions import session
+from evermap.maps.sessions import solve
 from evermap.types import AnyRecording, Cause, SlamResult, VerdictKind
 
 from .worlds import World
@@ -34,7 +34,7 @@ def record(world: World, kind: str) -> Any:
 def score(recording: AnyRecording) -> dict[str, scores.CalibrationScore]:
     """Return what a session tells of odometry that is solved as given, by codes."""
     config = Config.model_validate({"slam": {"explain": {"on": False}}})
-    asked = session.explained(Inputs.of(recording, None), config, ()).best.solution.asked
+    asked = solve.explain_session(Inputs.of(recording, None), config, ()).best.solution.asked
     return {one.suspect.code: one for one in score_odometry(asked)}
 
 
@@ -101,8 +101,8 @@ def test_what_is_left_of_a_zero_is_added_to_what_was_undone() -> None:
     inputs, config = Inputs.of(World(seed=1, drift=0.002, bias_radps=0.03).plane(), None), Config()
 
     def under(given: Inputs) -> Any:
-        visit = session.solved(given.recording, config, None, ())
-        return SessionSolution(visit, ScreenedSession(session.solution_of(visit), given), visit.concluded())
+        visit = solve.solve_session(given.recording, config, None, ())
+        return SessionSolution(visit, ScreenedSession(solve.solution_of(visit), given), visit.concluded())
 
     found = solve_with_right_turns(inputs, [Taken(TURN_BIAS, 0.022, 1.0)], under, config.slam)
     assert found is not None
@@ -115,7 +115,7 @@ def test_what_is_left_of_a_zero_is_added_to_what_was_undone() -> None:
 
 def test_what_is_usual_has_a_prior() -> None:
     inputs = Inputs.of(World(seed=1, seconds=10.0).space(), None)
-    usual = session.explained(inputs, Config(), ()).best.solution.asked.usual
+    usual = solve.explain_session(inputs, Config(), ()).best.solution.asked.usual
     assert [one.suspect.code for one in usual] == ["odometry-scale", "turn-scale", "turn-bias"]
     wide, narrow = (scores._find_shared(usual, share) for share in (1.0, 0.5))
     sigma = np.array([0.15, 0.15, 0.05])

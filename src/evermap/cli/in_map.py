@@ -207,7 +207,7 @@ def _run_in_map(
     """
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
-    from evermap.maps.sessions.session import in_its_space
+    from evermap.maps.sessions.admission import in_its_space
     from evermap.maps.store import open_store
     from evermap.pipeline import refuse_localization, run_localization
     from evermap.runs.sessions import at_time, begin_map, enter_session

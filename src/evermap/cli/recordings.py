@@ -193,9 +193,9 @@ def check_session(path: Path, *, force: bool, inputs: Sequence[str | Path | None
 def write_condensed(recording: AnyRecording, path: Path) -> None:
     """Write what a map needs of a recording, repaired first, as before it enters a map."""
     from evermap.io.native_write import write_session
-    from evermap.maps.sessions.session import repaired
+    from evermap.maps.sessions.admission import repair
 
-    write_session(repaired(recording), path)
+    write_session(repair(recording), path)
     say(f"wrote the session for a map to {path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 

@@ -14,7 +14,7 @@ from evermap.live.inbox import LiveFrame
 from evermap.live.keeper import News
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Sighting
-from evermap.maps.sessions.session import judged_so_far, lives_of
+from evermap.maps.sessions.session import judge_so_far, lives_of
 from evermap.maps.vicinity import Vicinity, near
 from evermap.slam.batch import sighted_at
 from evermap.slam.known_places import KnownPlaces
@@ -95,7 +95,7 @@ class Judge:
         if len(whole.places) > config.whole_places:
             vicinity = _around(whole, glances, self._sensor, config)
             living = vicinity.part
-        after, told = judged_so_far(living, _sighted(living, glances), self._sensor, config, self._classes)
+        after, told = judge_so_far(living, _sighted(living, glances), self._sensor, config, self._classes)
         changes, judged = _with_moves(told, glances, self._config.slam.fewest_sightings), after.landmarks()
         with self._lock:
             self._after = after, vicinity
@@ -176,4 +176,4 @@ def warm_up(config: Config) -> None:
     living = LivingMap.begun(marks).from_now_on(0.0)
     pose, frame = np.zeros((3, 3)), np.array([0, 1, 2, 2])
     sighting = Sighting(np.array([1.0, 2.0, 3.0]), pose, frame, np.array([0, 0, 0, 1]))
-    judged_so_far(living, sighting, Sensor(range_max_m=5.0), config.living)
+    judge_so_far(living, sighting, Sensor(range_max_m=5.0), config.living)

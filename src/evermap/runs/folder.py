@@ -401,7 +401,7 @@ def write_run(
         ConfigError: `out` must not or cannot be written.
         MissingExtraError: `scene` is True and rerun-sdk is missing, or `mcap` and rosbags.
     """
-    from evermap.maps.sessions.session import as_estimated
+    from evermap.maps.sessions.admission import as_estimated
     from evermap.metrics.summary import RATE_HZ, compare_with_truth, metrics_dict
 
     recording = as_estimated(recording, result)

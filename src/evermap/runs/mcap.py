@@ -61,7 +61,7 @@ def write_mcap(recording: AnyRecording, result: SlamResult, path: Path) -> None:
     Raises:
         MissingExtraError: `rosbags` is not installed.
     """
-    from evermap.maps.sessions.session import as_estimated
+    from evermap.maps.sessions.admission import as_estimated
 
     recording = as_estimated(recording, result)
     try:

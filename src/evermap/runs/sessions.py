@@ -165,7 +165,7 @@ def enter_session(
         DataError, NumericalError: as `pipeline.run_session`.
     """
     from evermap.maps.learning import with_priors
-    from evermap.maps.sessions.session import check_fits, in_its_space
+    from evermap.maps.sessions.admission import check_fits, in_its_space
     from evermap.pipeline import run_session
 
     check_type(recording)
@@ -313,7 +313,7 @@ def _refuse_twice(
     Raises:
         TwiceError: it is.
     """
-    from evermap.maps.sessions.session import drive_of, repaired, same_drive
+    from evermap.maps.sessions.admission import drive_of, is_same_drive, repair
 
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
@@ -321,7 +321,7 @@ def _refuse_twice(
     near = _spans(store, kept) if anew else _overlapping(store, kept, recording)
     if not near:
         return
-    fixed = repaired(recording)
+    fixed = repair(recording)
     ends = {_ends(recording), _ends(fixed)}
     alike = [number for number, span in near.items() if span in ends]  # others cannot be of its drive
     if anew:
@@ -331,7 +331,7 @@ def _refuse_twice(
     mine = since_start(drive_of(fixed)) if alike else ()
     for number in alike:
         other = read_recording_of(store, kept[number], number)
-        if type(other) is type(recording) and same_drive(mine, since_start(drive_of(repaired(other)))):
+        if type(other) is type(recording) and is_same_drive(mine, since_start(drive_of(repair(other)))):
             same = f"'{printable(other.name, 80)}' has the same frames and readings"
             problem = f"{recording.name}: its drive is in the map already, as revision {number}: {same}"
             raise _twice(store, number, problem, is_copy=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, EvermapError
 from evermap.io.spatial import spatial_detections
-from evermap.maps.sessions.session import as_estimated
+from evermap.maps.sessions.admission import as_estimated
 from evermap.runs.folder import SUMMARY
 from evermap.runs.summary import change_of
 from evermap.types import (

@@ -14,7 +14,7 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.maps.sessions.session import Session, begun_with
+from evermap.maps.sessions.session import Session, with_start_of
 from evermap.pipeline import run_session
 from evermap.slam.cleaning import some_frames
 from evermap.types import UNKNOWN, ChangeKind, Clock, FloatArray, Recording, rows_of
@@ -356,7 +356,7 @@ def test_a_session_is_as_old_as_its_recording_whatever_is_left_out(
     assert began_s == world.sessions[0].frames.stamp_s[0]
     for earlier_s, expected_s in ((10.0, began_s - 10.0), (-10.0, began_s)):
         frames = replace(world.sessions[0].frames, stamp_s=world.sessions[0].frames.stamp_s - earlier_s)
-        after = begun_with(sessions[0], replace(world.sessions[0], frames=frames))
+        after = with_start_of(sessions[0], replace(world.sessions[0], frames=frames))
         assert after.living.session_start_s == expected_s
 
 

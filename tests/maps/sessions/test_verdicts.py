@@ -12,7 +12,7 @@ import pytest
 from evermap import pipeline
 from evermap.config import Config
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions import session as session_steps
+from evermap.maps.sessions import solve
 from evermap.maps.sessions.session import Session, without_doubted
 from evermap.maps.store import open_store
 from evermap.pipeline import run_session
@@ -201,7 +201,7 @@ def test_what_moved_before_a_late_session_is_reported_where_it_is(lit: LivingMap
 
 
 def test_a_right_session_is_asked_for_no_cause(lit: LivingMap, right: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session_steps, "find_causes", None)
+    monkeypatch.setattr(solve, "find_causes", None)
     again = run_session(drive(1, make=LASER), lit)
     assert np.array_equal(again.slam.trajectory.pose_world_robot, right.slam.trajectory.pose_world_robot)
 
@@ -217,7 +217,7 @@ def test_a_session_is_entered_anew_for_causes_of_its_own_alone(
     solved = list[Any]()
     localise = pipeline._localise
     monkeypatch.setattr(pipeline, "_localise", lambda *given: solved.append(given) or localise(*given))
-    find = session_steps.find_causes
+    find = solve.find_causes
 
     def find_in_map(*given: Any, **more: Any) -> Any:
         found = find(*given, **more)
@@ -226,7 +226,7 @@ def test_a_session_is_entered_anew_for_causes_of_its_own_alone(
         causes = tuple(replace(cause, nats=nats) for cause in found.causes)
         return replace(found, best=replace(found.best, taken=(taken,)), causes=causes)
 
-    monkeypatch.setattr(session_steps, "find_causes", find_in_map)
+    monkeypatch.setattr(solve, "find_causes", find_in_map)
     session = run_session(drive(1, wrong.late(0.1), LASER), lit)
     assert len(solved) == (not of_map)
     assert [cause.code for cause in session.slam.causes] == told
@@ -236,7 +236,7 @@ def test_a_session_is_entered_anew_for_causes_of_its_own_alone(
 def test_what_was_held_is_suspected(living: LivingMap, lit: LivingMap, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing explains it, the session is refused as it is."""
     asked = list[bool]()
-    monkeypatch.setattr(session_steps, "find_causes", lambda *_, is_suspected: asked.append(is_suspected))
+    monkeypatch.setattr(solve, "find_causes", lambda *_, is_suspected: asked.append(is_suspected))
     session = run_session(drive(1, wrong.mounted(yaw=0.15)), living)
     assert find_held(session.slam.verdict) > 0.5
     assert (session.slam.causes, bool(session.refusal(Config().living))) == ((), True)

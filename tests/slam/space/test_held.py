@@ -10,7 +10,7 @@ import pytest
 from evermap.config import Config
 from evermap.explain.causes.suspect import Inputs
 from evermap.explain.scores import score_session
-from evermap.maps.sessions import session
+from evermap.maps.sessions import solve
 from evermap.pipeline import run_slam
 from evermap.slam.check import CLOCKWISE, read_corners
 from evermap.types import VerdictKind
@@ -39,7 +39,7 @@ def test_scores_of_lengths_are_zero_in_the_mean() -> None:
     seeds = range(6)
     for seed in seeds:
         world = tagged_corridor(seed, n_tags=16, n_frames=200, drift=0.03)
-        solution = session.explained(Inputs.of(world.recording, None), config, ()).best.solution
+        solution = solve.explain_session(Inputs.of(world.recording, None), config, ()).best.solution
         result, asked = solution.result, solution.asked
         for one in score_session(asked, result.trajectory).calibrations:
             score = math.copysign(math.sqrt(2.0 * one.gain), one.value)

@@ -28,11 +28,11 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.bodies import log_density, squared_length
 from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.names import anonymous_text, distinct_text
+from evermap.maps.sessions.admission import admit
 from evermap.maps.sessions.believe import aged
 from evermap.maps.sessions.box_search import TESTED_M2, windows
 from evermap.maps.sessions.gaussian import drifted
 from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
-from evermap.maps.sessions.session import admitted
 from evermap.slam.association import Identified, associate
 from evermap.slam.association.assignment import alike, visits_of, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
@@ -152,7 +152,7 @@ def identify_in(recording: AnyRecording, prior_map: Landmarks, config: Config) -
     living = replace(LivingMap.begun(prior_map, config.living.whole_places), clock=recording.clock)
     given = without_ids(recording, config)  # type: ignore[type-var]
     now = living.from_now_on(float(recording.frames.stamp_s[0]))
-    of_map, living = admitted(given, now)  # type: ignore[type-var]
+    of_map, living = admit(given, now)  # type: ignore[type-var]
     found, name, landmark_id = _met(of_map, living, config)
     ids = numbered(landmark_id, np.concatenate([prior_map.landmark_id, given.detections.landmark_id]))
     return Identified(with_ids(given, found.landmark_row, name, ids), found.evidence)  # type: ignore[type-var]

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from evermap.config import Config, LivingConfig
-from evermap.errors import DataError, NumericalError
+from evermap.config import LivingConfig
 from evermap.existence.sites import Evidence
-from evermap.explain.answer import in_given_units
-from evermap.explain.causes.suspect import Inputs
-from evermap.explain.competition import explain
-from evermap.explain.evidence import AnySession, SpatialSession
-from evermap.explain.put_right import find_late_sensor
-from evermap.explain.scores import ScreenedSession
-from evermap.explain.trial import Explained, SessionSolution, Trial
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, LivingMap, Places, Stays
+from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.sessions import believe, decide
+from evermap.maps.sessions.admission import begin_empty
 from evermap.maps.sessions.believe import Believed, arrived, departed, follow_occupants
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.looks import (
@@ -33,37 +26,29 @@ from evermap.maps.sessions.looks import (
     looked_at,
     weigh_misses,
 )
-from evermap.maps.sessions.placing import ANYWAY, Laid, Localised
+from evermap.maps.sessions.placing import Laid, Localised
 from evermap.maps.sessions.planar import PlanarVisit
-from evermap.maps.sessions.spatial import SpatialVisit, solve_visit
+from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.maps.vicinity import in_chunks
 from evermap.show import Shown
-from evermap.slam import plane
 from evermap.slam.association.features import medians
-from evermap.slam.cleaning import clean
-from evermap.slam.estimate import Solved, solve
-from evermap.slam.mistake_search import unusable
 from evermap.slam.space.up import with_known_up
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
     ChangeKind,
-    Detections,
     FloatArray,
     Landmarks,
     MapChange,
     Misses,
-    Progress,
     Recording,
     Sensor,
     SlamResult,
     SpatialRecording,
     VerdictKind,
-    is_in_space,
     rows_of,
     traits_of,
 )
-from evermap.valid import OVERLAP_S, check_type, has_own_clock
 
 RecordingT = TypeVar("RecordingT", Recording, SpatialRecording)
 
@@ -107,169 +92,9 @@ class Session(Shown):
         return verdict.text
 
 
-def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, LivingMap]:
-    """Return the recording as of `admit_recording`, and the map as of `with_names_of`, which raise the same."""
-    return admit_recording(recording, living), with_names_of(living, recording)
-
-
-def admit_recording(recording: RecordingT, living: LivingMap) -> RecordingT:
-    """Return the recording without landmarks that an operator deleted, and with the map's class numbers.
-
-    Raises:
-        DataError: another clock than the map's, or of the plane where that is of space.
-    """
-    check_fits(recording, living)
-    names = _class_names(living, recording)
-    number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
-    kept = ~np.isin(recording.detections.landmark_id, living.members.landmark_id[living.members.deleted])
-    detections = rows_of(recording.detections, kept)
-    detections = replace(detections, class_id=number[detections.class_id])
-    return replace(recording, detections=detections, class_names=names)
-
-
-def with_names_of(living: LivingMap, recording: AnyRecording) -> LivingMap:
-    """Return the map with the names of a recording's classes and landmarks, and with its clock.
-
-    Raises:
-        DataError: another clock than the map's, or of the plane where that is of space.
-    """
-    check_fits(recording, living)
-    return replace(
-        living,
-        class_names=_class_names(living, recording),
-        landmark_texts=tuple(sorted({*living.landmark_texts, *recording.landmark_names.values()})),
-        clock=recording.clock,
-    )
-
-
-def check_fits(recording: AnyRecording, living: LivingMap) -> None:
-    """Refuse a recording of another space or on another clock than the map."""
-    if (living.dim == 3) != is_in_space(recording):
-        of = {2: "the plane", 3: "space"}
-        raise DataError(
-            f"{recording.name}: a recording in {of[5 - living.dim]}, the map is of {of[living.dim]}",
-            field="living",
-            hint="one map file each",
-        )
-    if len(living.places) and recording.clock != living.clock:
-        raise DataError(
-            f"{recording.name}: its stamps are on the clock '{recording.clock}', those of the map on '{living.clock}'",
-            field="stamp_s",
-            hint="sessions of one map need one clock, preferably seconds since 1970",
-        )
-
-
-def _class_names(living: LivingMap, recording: AnyRecording) -> tuple[str, ...]:
-    """Names of the map's classes, then of the recording's new ones."""
-    return living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
-
-
-def with_overlap(recording: AnyRecording, living: LivingMap | None) -> AnyRecording:
-    """Return a recording with a remark where its clock overlaps what the map has seen, and it names no robot.
-
-    `enter_session`, which knows whose the other sessions are, refuses it.
-    """
-    stamp_s = recording.frames.stamp_s
-    if (
-        living is None
-        or not has_own_clock(recording)
-        or recording.robot
-        or not float(stamp_s[0]) < living.stamp_s - OVERLAP_S
-    ):
-        return recording
-    remark = (
-        f"its clock ({stamp_s[0]:.1f} to {stamp_s[-1]:.1f} s) overlaps what the map has seen (until "
-        f"{living.stamp_s:.1f} s): one robot cannot have driven both at once; give each session its own time"
-    )
-    return replace(recording, warnings=(*recording.warnings, remark))
-
-
-def in_its_space(recording: AnyRecording, living: LivingMap | None, config: Config) -> AnyRecording:
-    """Return a recording as it goes into a map: in the plane where it is one of a robot on a floor (`slam.plane`).
-
-    Raises:
-        ConfigError: `slam.plane` is set, and it cannot be there.
-    """
-    dim = None if living is None or not len(living.places) else living.dim
-    return plane.in_its_space(recording, config.slam, dim=dim)
-
-
-def as_estimated(recording: AnyRecording, result: SlamResult) -> AnyRecording:
-    """Return a recording in the space of its result: in the plane where it was estimated there."""
-    flat = result.trajectory.pose_world_robot.shape[1] == 3
-    if not flat or not is_in_space(recording):
-        return recording
-    return plane.in_its_space(recording, Config().slam, dim=2)
-
-
-def check_static(recording: SpatialRecording, config: Config) -> None:
-    """Refuse a session in which a mistake in units, axes or clocks makes static landmarks move.
-
-    Raises:
-        DataError: names the mistake, as `evermap check` does. Where `living.search` is not 'joint', nothing is refused.
-    """
-    wrong = unusable(recording, config.slam.check) if config.living.search == "joint" else None
-    if wrong is not None and not wrong.usable:
-        raise DataError(f"{recording.name}: {wrong.message}", hint=ANYWAY)
-
-
-def opened(living: LivingMap | None, recording: AnyRecording) -> LivingMap:
-    """Return a map as a recording finds it: None, and one without a landmark, begin in its space and with its clock.
-
-    Raises:
-        InputError: no `Recording`.
-        DataError: it begins before the newest session of the map.
-    """
-    check_type(recording)
-    if living is None:
-        living = _empty(recording)
-    elif is_in_space(recording) and not len(living.places):
-        living = replace(living, places=Places.empty(3), stays=Stays.empty(3), clock=recording.clock)
-    if len(recording.frames):
-        start_s = float(recording.frames.stamp_s[0])
-        living = living.from_now_on(start_s)
-        if start_s < living.session_start_s:
-            raise DataError(
-                f"{recording.name}: begins at {start_s:.1f} s, before the newest session of the map, "
-                f"{living.session_start_s:.1f} s",
-                field="stamp_s",
-                hint="evermap.enter_session(store, recording), or evermap map enter, enter it at its time",
-            )
-    return living
-
-
-def _empty(recording: AnyRecording) -> LivingMap:
-    """A map before its first session, in the plane or in space as a recording of it."""
-    in_space = is_in_space(recording)
-    return LivingMap.in_space(recording.clock) if in_space else LivingMap(clock=recording.clock)
-
-
-def repaired(recording: AnyRecording) -> AnyRecording:
-    """Return a recording as it is condensed: one of the plane repaired, one of space as it is."""
-    return recording if is_in_space(recording) else clean(recording)
-
-
-def drive_of(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
-    """Return what all copies of a drive have in common once they are `repaired`: (F,) stamps of frames, and (M, K)
-    sorted readings, each with the stamp of its frame, in single precision, as in a session that was condensed.
-    """
-    seen, stamp_s = recording.detections, recording.frames.stamp_s
-    if isinstance(seen, Detections):
-        read = np.column_stack([seen.range_m, seen.bearing_rad])
-    else:
-        read = np.column_stack([seen.position_sensor_m, seen.corner_px.reshape(len(seen), -1)])
-    rows = np.column_stack([stamp_s[seen.frame], read.astype(np.float32)])
-    return stamp_s, rows[np.lexsort(rows.T[::-1])]
-
-
-def same_drive(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> bool:
-    """Return whether two results of `drive_of` are equal."""
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
-
-
-def begun_with(session: Session, recording: AnyRecording) -> Session:
+def with_start_of(session: Session, recording: AnyRecording) -> Session:
     """Return a session of a map that began with its recording, whatever of that was left out: sessions are in the order
-    of their recordings (`opened`).
+    of their recordings (`open_map`).
     """
     if not session.found:
         return session
@@ -302,7 +127,7 @@ class Judged:
     watch: Watch
 
 
-def judged(
+def judge(
     living: LivingMap,
     where: Laid | None,
     visit: Visit,
@@ -340,7 +165,7 @@ def judged(
     return Judged(after, changes, found, entry, now, seen, watch)
 
 
-def missed(living: LivingMap, p_site: FloatArray, seen: PlaceLooks, visit: Visit) -> Misses:
+def list_misses(living: LivingMap, p_site: FloatArray, seen: PlaceLooks, visit: Visit) -> Misses:
     """Return the looks that count as misses of landmarks at their most probable places after the session, by beliefs
     (S,) in the sites of the map.
 
@@ -356,7 +181,7 @@ def missed(living: LivingMap, p_site: FloatArray, seen: PlaceLooks, visit: Visit
     return Misses(frame.astype(np.int64), living.places.landmark_id[place[rows]], p_detect)
 
 
-def learned(judged: Judged, classes: ClassLives | None, config: LivingConfig) -> LivingMap:
+def learn(judged: Judged, classes: ClassLives | None, config: LivingConfig) -> LivingMap:
     """Return the map after a session, with what it taught of lifetimes, and of from where places are seen."""
     after, seen = judged.living, judged.seen
     lines = after.sightlines if config.learn_sight else judged.entry.before.sightlines
@@ -373,14 +198,14 @@ def learned(judged: Judged, classes: ClassLives | None, config: LivingConfig) ->
     return replace(after, sightlines=lines, views=views, glimpses=glimpses, lives=lives)
 
 
-def told(judged: Judged, living: LivingMap, where: Laid | None, visit: Visit) -> Session:
+def conclude(judged: Judged, living: LivingMap, where: Laid | None, visit: Visit) -> Session:
     """Return the session with its map and changes; its landmarks have hits and misses of all sessions of the map."""
     frame = "first_pose" if where is None else "prior_map"
     names = {**visit.recording.landmark_names, **living.landmark_names}
     known = replace(living.landmarks(), frame=frame, names=names)
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in judged.changes)
-    misses = missed(judged.entry.living, judged.now.sites.p_here, judged.seen, visit)
+    misses = list_misses(judged.entry.living, judged.now.sites.p_here, judged.seen, visit)
     concluded = visit.concluded()
     known = replace(landmarks, up=concluded.landmarks.up)
     slam = replace(concluded, landmarks=known, misses=misses, changes=changes, gone=gone)
@@ -390,7 +215,7 @@ def told(judged: Judged, living: LivingMap, where: Laid | None, visit: Visit) ->
     return Session(living, True, visit.used, slam, changes, judged.now.evidence)
 
 
-def brought_in(
+def bring_in(
     session: Localised[PlanarVisit] | Localised[SpatialVisit], whole: LivingMap, config: LivingConfig
 ) -> Session:
     """Return the result of a session in a map, judged twice: the second time with the lifetimes learned in the first.
@@ -399,17 +224,17 @@ def brought_in(
     """
     visit, where = session.visit, session.where
     if session.reason:
-        slam = existing(visit, visit.concluded(), config)
+        slam = add_existence(visit, visit.concluded(), config)
         slam = replace(slam, warnings=(*slam.warnings, f"set aside: {session.reason[0]}"))
         return Session(whole, False, visit.used, slam, (), Evidence.empty(), session.reason)
     living = replace(session.living, sightlines=replace(session.living.sightlines, rules=config.sight))
-    judged_now = judged(living, where, visit, config)
+    judged_now = judge(living, where, visit, config)
     classes = lives_after(judged_now.living, config)
     if classes is not None:
         living = replace(living, lives=replace(classes.lives, looks_s=living.lives.looks_s))
-        judged_now = judged(living, where, visit, config, classes, judged_now)
+        judged_now = judge(living, where, visit, config, classes, judged_now)
         classes = lives_after(judged_now.living, config)
-    after = told(judged_now, learned(judged_now, classes, config), where, visit)
+    after = conclude(judged_now, learn(judged_now, classes, config), where, visit)
     living = after.living if session.vicinity is None else session.vicinity.put_back(after.living)
     return replace(after, living=decide.without_strays(in_chunks(with_traits(living, visit.used), config)))
 
@@ -426,88 +251,6 @@ def with_traits(living: LivingMap, recording: AnyRecording) -> LivingMap:
     return replace(living, traits=living.traits.met(names[known], columns, value[known]))
 
 
-def solved(
-    recording: AnyRecording,
-    config: Config,
-    prior_map: Landmarks | None,
-    remarks: tuple[str, ...],
-    *,
-    realtime: bool = False,
-    progress: Progress | None = None,
-) -> Visit:
-    """Return a recording with identities solved, by itself or in a map that is given; arguments as of `run_slam`."""
-    if is_in_space(recording):
-        return solve_visit(recording, config, prior_map, remarks, progress=progress)
-    alone = solve(recording, config.slam, prior_map=prior_map, remarks=remarks, realtime=realtime, progress=progress)
-    return PlanarVisit(alone)
-
-
-def explained(
-    inputs: Inputs,
-    config: Config,
-    remarks: tuple[str, ...],
-    *,
-    realtime: bool = False,
-    progress: Progress | None = None,
-    is_read_well: bool = False,
-    is_suspected: bool = False,
-    solution: SessionSolution[Visit] | None = None,
-) -> Explained[Visit]:
-    """Return a session solved, with its result: as given, or under the causes that explain it better (`explain`), its
-    calibration in the units that were given.
-
-    Args:
-        inputs: with identities.
-        config: settings.
-        remarks: on the recording, the first warnings.
-        realtime: as of `run_slam`, of the session as given.
-        progress: the same.
-        is_read_well: whether pairs of sightings are known to show no mistake.
-        is_suspected: whether scores say that a calibration is not as stated.
-        solution: of the inputs as given, where it is known.
-
-    Raises:
-        DataError, NumericalError: as of `run_slam`.
-    """
-
-    def under(given: Inputs, known: Solved | None = None, **more: Any) -> SessionSolution[Visit]:
-        visit: Visit
-        if known is None:
-            visit = solved(given.recording, config, given.prior_map, remarks, **more)
-        else:
-            visit = PlanarVisit(known)
-        result = visit.concluded()
-        if not np.isfinite(result.trajectory.pose_world_robot).all():
-            raise NumericalError("the solution has poses that are no numbers", hint="check units, mounts and stamps")
-        return SessionSolution(visit, ScreenedSession(solution_of(visit), given), result)
-
-    told = list[str]()
-    try:
-        as_given = solution or under(inputs, realtime=realtime, progress=progress)
-    except (DataError, NumericalError):
-        found = None
-        if config.slam.explain.on:
-            found = explain(inputs, None, under, config.slam, told.append)
-        if found is None:
-            raise
-    else:
-        if not config.slam.explain.on or as_given.result.interrupted or realtime:
-            return Explained(Trial(as_given, (), math.nan, 1.0), ())
-        found = explain(
-            inputs, as_given, under, config.slam, told.append, is_read_well=is_read_well, is_suspected=is_suspected
-        )
-        assert found is not None
-    if not found.causes:
-        return found
-    result = replace(in_given_units(found.best), causes=found.causes)
-    return replace(found, best=replace(found.best, solution=replace(found.best.solution, result=result)))
-
-
-def solution_of(visit: Visit) -> AnySession:
-    """Return what a session's estimate is, as causes are asked of it."""
-    return visit.solved if isinstance(visit, PlanarVisit) else SpatialSession(visit.intake, visit.solved)
-
-
 def without_doubted(session: Session, before: LivingMap, config: LivingConfig) -> Session:
     """Return a session; where it does not enter the map (`Session.refusal`), which was as `before` it, without what it
     says has changed: what is not believed is not reported.
@@ -520,46 +263,7 @@ def without_doubted(session: Session, before: LivingMap, config: LivingConfig) -
     return replace(session, slam=replace(session.slam, changes=(), alternatives=(), gone=still), changes=())
 
 
-def with_causes(session: Session, living: LivingMap, config: Config) -> Session:
-    """Return a session that was set aside with causes other than changes, if any explain why it does not fit the map.
-
-    It is not entered under them: that is for who trusts them, or mends the recording.
-    """
-    if session.found or not config.slam.explain.on or not len(living.places):
-        return session
-    found = find_causes(session, living, config)
-    return session if found is None else replace(session, slam=replace(session.slam, causes=found.causes))
-
-
-def find_causes(
-    session: Session, living: LivingMap, config: Config, *, is_suspected: bool = False
-) -> Explained[Visit] | None:
-    """Return what explains a session, solved by itself with the map as one that is given; None if nothing can be.
-
-    `is_suspected` is as of `explain`.
-    """
-    expected = living.landmarks(p_least=EXISTS) if len(living.places) else None
-    try:
-        return explained(Inputs.of(session.recording, expected), config, (), is_suspected=is_suspected)
-    except (DataError, NumericalError):
-        return None
-
-
-def is_doubtful(session: Session) -> bool:
-    """Return whether causes are to be asked of a session with its verdict: it is neither sound nor weak, or its sensor
-    is late.
-    """
-    slam = session.slam
-    return not slam.is_trustworthy or find_late_sensor(slam, Inputs.of(session.recording, None)) is not None
-
-
-def with_calibration(session: Session, found: Explained[Visit]) -> Session:
-    """Return a session that was entered without what causes did, with these, and its calibration in the units given."""
-    trial = replace(found.best, solution=replace(found.best.solution, result=session.slam))
-    return replace(session, slam=replace(in_given_units(trial), causes=found.causes))
-
-
-def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
+def add_existence(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
     """Return the result of a single recording with its misses and the belief that each landmark exists.
 
     Both are those of a living map whose first session the recording is.
@@ -580,7 +284,7 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
         rotation=mapped.rotation,
         rotation_covariance=mapped.rotation_covariance,
     )
-    empty = _empty(visit.recording)
+    empty = begin_empty(visit.recording)
     lines = replace(empty.sightlines, rules=config.sight)
     empty = replace(empty, class_names=visit.recording.class_names, sightlines=lines)
     entry = extended(empty, empty.sites, found, config, 0.0)
@@ -591,7 +295,7 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
     row = np.searchsorted(judged_now.landmark_id, mapped.landmark_id)
     p_exists = judged_now.p_exists[row] if config.existence else mapped.p_exists
     mapped = replace(mapped, p_exists=p_exists, n_misses=judged_now.n_misses[row])
-    return replace(slam, landmarks=mapped, misses=missed(living, now.sites.p_here, seen, visit))
+    return replace(slam, landmarks=mapped, misses=list_misses(living, now.sites.p_here, seen, visit))
 
 
 def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingConfig) -> SlamResult:
@@ -652,7 +356,7 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     return replace(slam, misses=every, gone=gone, changes=(*slam.changes, *told))
 
 
-def judged_so_far(
+def judge_so_far(
     living: LivingMap, sighting: Sighting, sensor: Sensor, config: LivingConfig, classes: ClassLives | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """Return the map with beliefs after a part of a drive, from the causal poses, and the changes since the last
