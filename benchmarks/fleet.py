@@ -316,7 +316,7 @@ def _simulated(
 ) -> tuple[dict[str, list[Upload]], dict[str, LivingMap]]:
     """Sessions by site, and the maps that they give in order."""
     from evermap.runs.sessions import enter_session
-    from evermap.server.uploads import UploadLimits, checked_digest, recording_of
+    from evermap.server.uploads import UploadLimits, check_digest, recording_of
 
     uploads: dict[str, list[Upload]] = {}
     expected = {}
@@ -333,7 +333,7 @@ def _simulated(
                     for file in sorted(path.iterdir()):
                         archive.write(file, f"{path.name}/{file.name}")
                 data, robot = buffer.getvalue(), f"{site} robot {day % robots}"
-                read = recording_of(data, checked_digest(data, UploadLimits()))
+                read = recording_of(data, check_digest(data, UploadLimits()))
                 entered = enter_session(store, replace(read, robot=robot))
                 if entered.session.found:  # a patrol that sees too little of the map has no place in any order
                     uploads[site].append(Upload(data, robot))

@@ -107,7 +107,7 @@ def test_one_problem_of_several_robots() -> None:
     assert set(specialised) == {"PlanarTogether", "SpatialTogether"}
     for one in specialised.values():
         methods = {node.name for node in one.body if isinstance(node, ast.FunctionDef)}
-        assert not methods & {"graph_in_slices", "variables", "minimised_in_slices", "linearised_in_slices"}
+        assert not methods & {"graph_in_slices", "variables", "minimise_in_slices", "linearise_in_slices"}
 
 
 def numbers() -> Iterator[tuple[str, bool]]:
@@ -142,7 +142,7 @@ def test_constants_say_what_they_are() -> None:
 
 ONE_OF_EACH = {
     # one damped Gauss-Newton; smoothers in space do not go through `Solver` yet, since their levels are arguments
-    "minimised": {"estimate.solver", "slam.space.smoother"},
+    "minimise": {"estimate.solver", "slam.space.smoother"},
     # one rule for noise levels: in the plane, in space, and of what robots measure of each other
     "restricted_level": {"slam.noise", "slam.space.estimate", "slam.planar_together"},
     # one loop of values and levels in turns; robots together and landmarks without identities have loops of their own

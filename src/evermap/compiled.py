@@ -237,12 +237,12 @@ def _keeper() -> Callable[[Any], Any]:
                 _AT_FIRST_MISSING.pop()()
             if found is None and self.turn is not None:
                 name = hashlib.sha256(str(sig).encode()).hexdigest()[:8]
-                self.turn.enter_context(_locked(Path(self.cache_path), f"{self._impl.filename_base}.{name}"))
+                self.turn.enter_context(_hold_lock(Path(self.cache_path), f"{self._impl.filename_base}.{name}"))
                 found = self._load(sig, target_context)
             return found
 
         def _load(self, sig: Any, target_context: Any) -> Any:
-            with _locked(Path(self.cache_path)):
+            with _hold_lock(Path(self.cache_path)):
                 self._stamp()
                 try:
                     return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -251,7 +251,7 @@ def _keeper() -> Callable[[Any], Any]:
                     return None
 
         def save_overload(self, sig: Any, data: Any) -> None:
-            with _locked(Path(self.cache_path)):
+            with _hold_lock(Path(self.cache_path)):
                 self._stamp()
                 try:
                     super().save_overload(sig, data)  # type: ignore[no-untyped-call]
@@ -304,7 +304,7 @@ def temporary_folder() -> str:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path, name: str = "machine-code") -> Iterator[None]:
+def _hold_lock(folder: Path, name: str = "machine-code") -> Iterator[None]:
     try:
         import fcntl
     except ImportError:  # Windows has no such lock: processes there do as numba alone has them do

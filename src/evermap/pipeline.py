@@ -315,7 +315,7 @@ def run_session(
         admission.check_static(recording, config)
         recording, living = admission.admit(recording, living)
         if config.slam.unknown_ids:
-            recording, living = admission.admit(nameless.named_in(recording, living, config), living)
+            recording, living = admission.admit(nameless.name_in(recording, living, config), living)
         located = boxes.localised(recording, living, config, remarks, progress)
     else:
         alone = solve_alone(recording, living, config, progress=progress)
@@ -342,7 +342,7 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     recording, remarks, found = check.screened(nameless.without_ids(recording, config), config, repair=True)
     recording = admission.admit_recording(recording, living)
     if config.slam.unknown_ids:
-        recording = admission.admit_recording(nameless.named_in(recording, living, config), living)
+        recording = admission.admit_recording(nameless.name_in(recording, living, config), living)
     recording, moved = without_motion(recording, config)
     remarks = (*remarks, *moved)
     solved = estimate.solve(*planar.prepare_alone(recording, config), remarks=remarks, progress=progress)
@@ -467,7 +467,7 @@ def run_localization(
         if has_traffic(recording):  # boxes at rest are told from those that move by what comes later
             p_site = believe.aged(living, config.living, start_s).p_here
             return run_slam(recording, config, prior_map=spatial.standing(living, p_site), progress=progress)
-        places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
+        places = living.list_sighted(vicinity.predict_sites(living, named, config.living, start_s))
         joint = living.covariance_m2
         result = localize_in_space(recording, places, config, joint_m2=joint, realtime=realtime, progress=progress)
         found = (*riders, *check.odd(recording, config.slam))
@@ -476,7 +476,7 @@ def run_localization(
     found = (*riders, *check.odd(recording, config.slam))
     recording, living = admission.admit(recording, living)
     named, start_s = recording.detections.landmark_id, float(recording.frames.stamp_s[0])
-    places = living.sighted_rows(vicinity.predicted_of(living, named, config.living, start_s))
+    places = living.list_sighted(vicinity.predict_sites(living, named, config.living, start_s))
     joint, believed = living.covariance_m2, intake.beliefs(recording.sensor, config.slam)
     result = localize(recording, places, *believed, config, joint_m2=joint, realtime=realtime, progress=progress)
     result = with_verdict(result, recording, config.slam, living.landmarks(p_least=0.0), findings=found)

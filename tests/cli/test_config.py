@@ -248,11 +248,11 @@ def test_unreadable_files(tmp_path: Path) -> None:
 
 def test_sensor_section_corrects_only_what_it_sets() -> None:
     sensor = Sensor(range_max_m=9.0, sigma_range_m=0.1)
-    assert SensorConfig().applied_to(sensor) == sensor
-    merged = SensorConfig(range_max_m=4.0).applied_to(sensor)
+    assert SensorConfig().apply_to(sensor) == sensor
+    merged = SensorConfig(range_max_m=4.0).apply_to(sensor)
     assert (merged.range_max_m, merged.sigma_range_m) == (4.0, 0.1)
     with pytest.raises(ConfigError, match="range_min_m"):
-        SensorConfig(range_min_m=9.0).applied_to(sensor)
+        SensorConfig(range_min_m=9.0).apply_to(sensor)
 
 
 def test_command_line_shows_the_configuration_in_force() -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.estimate.graph import Layout, build_structure
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.types import IntArray
 
 
@@ -30,7 +30,7 @@ def make_structure():
     place, pose = np.array([5, 6, 7, 6, 5, 7]), np.array([0, 1, 1, 2, 4, 4])
     seen = Block(np.column_stack([pose, place, np.full(6, 8)]), np.array([6, 3, 8, 3, 8, 6]), pose)
     none = Block(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-    return (steps, seen, none), exhausted(build_structure(layout, (steps, seen, none)))
+    return (steps, seen, none), exhaust(build_structure(layout, (steps, seen, none)))
 
 
 def test_a_layout_has_poses_then_places_then_the_border():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from evermap.estimate.solver import Solver
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 
 
 class Counted:
@@ -35,9 +35,9 @@ def test_the_last_values_are_linearised_once() -> None:
     first = estimator.linearised(state)
     assert first == ("linear", state)
     assert estimator.linearised(state) is first
-    assert list(estimator.linearised_in_slices(state)) == []
+    assert list(estimator.linearise_in_slices(state)) == []
     assert len(estimator.one.asked) == 1
     assert estimator.linearised(other)[1] is other
-    assert list(estimator.linearised_in_slices(state)) == [0.5, 1.0]
+    assert list(estimator.linearise_in_slices(state)) == [0.5, 1.0]
     assert [one is state for one in estimator.one.asked] == [True, False, True]
-    assert exhausted(estimator.linearised_in_slices(state))[1] is state
+    assert exhaust(estimator.linearise_in_slices(state))[1] is state

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evermap.existence.learn_sojourns import ranked_fits
+from evermap.existence.learn_sojourns import rank_fits
 from evermap.existence.lifetimes import edges
 from evermap.existence.rhythm import BINS, HALF_AN_EVENT
 from evermap.existence.sojourns import (
@@ -160,7 +160,7 @@ def test_a_smooth_hazard_follows_any(durations: dict[str, FloatArray]) -> None:
 
 @pytest.mark.parametrize("name", TRUE)
 def test_enough_durations_tell_their_family(durations: dict[str, FloatArray], name: str) -> None:
-    assert ranked_fits(counted(durations[name]), tuple(FAMILIES), None, rhythm=False)[0].family == name
+    assert rank_fits(counted(durations[name]), tuple(FAMILIES), None, rhythm=False)[0].family == name
 
 
 @pytest.mark.parametrize("name", FAMILIES)

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal, norm
 from evermap.config import SlamConfig
 from evermap.config.slam import NoiseConfig
 from evermap.estimate.graph import Border, Graph, Layout, Room, build_structure, grouped
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.explain import scores
 from evermap.explain.causes.suspect import USUAL_P, Suspect
 from evermap.explain.evidence import (
@@ -77,7 +77,7 @@ def problem() -> tuple[Graph[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     held = np.zeros(border + 1)
     held[N_POSES:border] = 0.25
     prior = Border(np.array([4.0]), lambda state: state[-1:])
-    graph = Graph(blocks, exhausted(build_structure(layout, blocks)), prior, held, lambda x, step: (x + step, 0.0))
+    graph = Graph(blocks, exhaust(build_structure(layout, blocks)), prior, held, lambda x, step: (x + step, 0.0))
     rows = [np.zeros(border + 1) for _ in range(2 * sum(len(block.ties) for block in blocks))]
     measured = np.concatenate([block.measured.ravel() for block in blocks])
     at = 0
@@ -98,7 +98,7 @@ def test_evidence_is_the_marginal_likelihood_of_a_linear_problem(problem: tuple)
     graph = Graph(graph.blocks, graph.structure, graph.border, held, graph.retract)
     hessian = dense.T @ dense + np.diag(information)
     state = np.linalg.solve(hessian, dense.T @ measured)
-    now = exhausted(graph.linearised(state))
+    now = exhaust(graph.linearised(state))
     free = information[:-1]  # priors of all but the border
     quadratic = 0.5 * float(free @ state[:-1] ** 2)
     peaks = 0.5 * float(np.log(free).sum()) - 0.5 * len(free) * LOG_2PI - 0.5 * len(measured) * LOG_2PI - quadratic
@@ -106,7 +106,7 @@ def test_evidence_is_the_marginal_likelihood_of_a_linear_problem(problem: tuple)
     found = evidence_at(Optimum(graph, now, state, empty, peaks, 0.0, 1.0))
     exact = multivariate_normal(cov=np.eye(len(measured)) + dense @ np.diag(1.0 / information) @ dense.T)
     assert found == pytest.approx(float(exact.logpdf(measured)), abs=1e-8)
-    solved = exhausted(graph.factorised(now))
+    solved = exhaust(graph.factorised(now))
     assert solved.log_determinant == pytest.approx(float(np.linalg.slogdet(hessian)[1]), abs=1e-9)
 
 
@@ -115,7 +115,7 @@ def test_score_is_the_step_of_one_more_number(problem: tuple) -> None:
     random = np.random.default_rng(5)
     state = np.linalg.solve(dense.T @ dense + np.diag(information), dense.T @ measured)
     state = state + 0.01 * random.normal(size=len(state))  # nearly at the optimum, as an iteration ends
-    now = exhausted(graph.linearised(state))
+    now = exhaust(graph.linearised(state))
     empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
     screen = Screen.of(Optimum(graph, now, state, empty, 0.0, 0.0, 1.0))
     direction, prior, off = random.normal(size=len(measured)), 3.0, 0.2
@@ -135,7 +135,7 @@ def test_two_more_numbers_share_what_is_left_of_them_without_all_others(problem:
     graph, dense, measured, information = problem
     random = np.random.default_rng(6)
     state = np.linalg.solve(dense.T @ dense + np.diag(information), dense.T @ measured)
-    now = exhausted(graph.linearised(state))
+    now = exhaust(graph.linearised(state))
     empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
     screen = Screen.of(Optimum(graph, now, state, empty, 0.0, 0.0, 1.0))
     directions = random.normal(size=(2, len(measured)))
@@ -154,7 +154,7 @@ def test_the_variance_of_a_slope_is_by_residuals_before_or_after_its_step(proble
     """Of a long step few rows would make more of what is linear than there is: of the two the smaller holds."""
     graph, dense, measured, information = problem
     state = np.linalg.solve(dense.T @ dense + np.diag(information), dense.T @ measured)
-    now = exhausted(graph.linearised(state))
+    now = exhaust(graph.linearised(state))
     empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
     screen = Screen.of(Optimum(graph, now, state, empty, 0.0, 0.0, 1.0))
     column = screen.column(np.random.default_rng(7).normal(size=len(measured)))
@@ -172,7 +172,7 @@ def optimum_with(problem: tuple, *scales: ScalePrior, worth: float = 1.0) -> tup
     graph, dense, measured, information = problem
     hessian = dense.T @ dense + np.diag(information)
     state = np.linalg.solve(hessian, dense.T @ measured)
-    now = exhausted(graph.linearised(state))
+    now = exhaust(graph.linearised(state))
     empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
     without = np.linalg.inv(hessian - np.diag(np.append(np.zeros(N_POSES + N_PLACES), 4.0)))
     told = without @ dense.T @ measured  # without the prior of the border
@@ -222,7 +222,7 @@ def test_what_is_usual_of_odometry_is_marginalised(problem: tuple, monkeypatch: 
     held[:N_POSES] = information[:N_POSES] = 1e-2
     graph = Graph(graph.blocks, graph.structure, graph.border, held, graph.retract)
     state = np.zeros(len(information))  # nothing pulls there but what was measured
-    now = exhausted(graph.linearised(state))
+    now = exhaust(graph.linearised(state))
     empty = DetectionTerms(*(np.zeros(0) for _ in range(5)))
     optimum = Optimum(graph, now, state, empty, 0.0, 0.0, 1.0)
     names = ("turn-bias", "turn-scale")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evermap.config import Config
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.explain.causes import list_suspects
 from evermap.explain.causes.suspect import Inputs
 from evermap.explain.evidence import residuals_of
@@ -44,7 +44,7 @@ def test_a_cause_in_the_plane_changes_residuals_as_if_all_were_linearised(*, in_
             rows = np.searchsorted(given.landmark_id, solved.prepared.landmark_id)
             moved = replace(moved, landmark_mean=undone.prior_map.position_m[rows])
         smoother = Smoother(moved, solved.outcome.noise.noise, robust=solved.settings.robust)
-        now = exhausted(replace(graph, blocks=smoother.blocks(state.known)).linearised(state))
+        now = exhaust(replace(graph, blocks=smoother.blocks(state.known)).linearised(state))
         expected = (residuals_of(graph, now)[0] - screen.residual) / step
         assert np.abs(expected).max() > 0.0, suspect.subject
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()), suspect.subject

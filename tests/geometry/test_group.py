@@ -196,11 +196,11 @@ def test_jacobians_are_gtsams(case, data):
 @given(data)
 def test_normalised_poses_are_the_same_motions_in_one_form(case, data):
     pose = data.draw(case.poses())
-    found = case.group.normalised(pose)
+    found = case.group.normalise_poses(pose)
     assert_same(case, found, case.matrix(pose))
-    assert case.group.normalised(found) == pytest.approx(found, abs=3e-16)
+    assert case.group.normalise_poses(found) == pytest.approx(found, abs=3e-16)
     if case.name == "space":
-        other = case.group.normalised([*pose[:3], *(-3.0 * pose[3:])])
+        other = case.group.normalise_poses([*pose[:3], *(-3.0 * pose[3:])])
         assert other == pytest.approx(found, abs=3e-16)
 
 
@@ -223,7 +223,7 @@ def test_functions_broadcast_over_leading_axes(case):
         assert all_pairs.shape[:2] == (4, 5)
         rows = [[function(a[i, 0], b[j]) for j in range(5)] for i in range(4)]
         np.testing.assert_array_equal(all_pairs, rows)
-    for function in (g.inverse, g.log, g.adjoint, g.rotation_of, g.normalised):
+    for function in (g.inverse, g.log, g.adjoint, g.rotation_of, g.normalise_poses):
         np.testing.assert_array_equal(function(b), [function(row) for row in b])
     for function in (g.exp, g.bracket, g.right_jacobian_inverse):
         np.testing.assert_allclose(function(twist), [function(row) for row in twist], rtol=0, atol=1e-15)

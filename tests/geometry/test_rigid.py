@@ -31,7 +31,7 @@ def test_noisy_fits_are_gtsams(case, seed) -> None:
     source = g.transform(g.exp(rng.normal(0, 2, g.dim)), target + rng.normal(0, 0.3, target.shape)) + 20.0
     found = rigid(source, target)
     np.testing.assert_allclose(case.matrix(found), case.peer.Align(target.T, source.T).matrix(), atol=1e-12)
-    np.testing.assert_allclose(found, g.normalised(found), atol=1e-15)
+    np.testing.assert_allclose(found, g.normalise_poses(found), atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -42,7 +42,7 @@ def test_no_layout_of_rows_waits_for_the_compiler_after_the_warm_up() -> None:
         assert composed == pytest.approx(se3.compose(POSES, OTHERS), abs=1e-12)
         assert se3.transform(se3.inverse(rows), se3.transform(rows, POINTS)) == pytest.approx(POINTS, abs=1e-12)
         assert se3.exp(se3.log(se3.between(rows, composed))) == pytest.approx(OTHERS, abs=1e-12)
-        assert se3.rotation_of(se3.normalised(rows)) == pytest.approx(se3.rotation_of(POSES), abs=1e-12)
+        assert se3.rotation_of(se3.normalise_poses(rows)) == pytest.approx(se3.rotation_of(POSES), abs=1e-12)
     assert signatures() == before
     assert not frozen.flags.writeable
     assert before["compose"] == 1

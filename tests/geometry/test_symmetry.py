@@ -24,7 +24,7 @@ def turned(random: np.random.Generator, count: int) -> np.ndarray:
     ],
 )  # fmt: skip
 def test_generators_make_the_groups_that_scipy_lists(generators, group):
-    found = Rotation.from_quat(Symmetry.generated(generators).turns)
+    found = Rotation.from_quat(Symmetry.generate_group(generators).turns)
     expected = Rotation.create_group(group)
     assert len(found) == len(expected)
     off = np.array([[(a.inv() * b).magnitude() for b in expected] for a in found])
@@ -48,7 +48,7 @@ def test_generators_make_the_groups_that_scipy_lists(generators, group):
 )
 def test_other_texts_are_refused(generators, problem):
     with pytest.raises(ValueError, match=problem):
-        Symmetry.generated(generators)
+        Symmetry.generate_group(generators)
 
 
 def about(axis: str, flip: str | None) -> Rotation:
@@ -69,7 +69,7 @@ def about(axis: str, flip: str | None) -> Rotation:
 def test_the_nearest_of_all_is_found(generators, group):
     random = np.random.default_rng(5)
     pose, reference = turned(random, 12), turned(random, 12)
-    symmetry = Symmetry.generated(generators)
+    symmetry = Symmetry.generate_group(generators)
     found = symmetry.nearest(pose, reference)
     assert np.array_equal(found[:, :3], pose[:, :3])
     least = symmetry.angle_between(pose, reference)
@@ -85,7 +85,7 @@ def test_the_nearest_of_all_is_found(generators, group):
 def test_a_ball_has_no_orientation():
     random = np.random.default_rng(6)
     pose, reference = turned(random, 3), turned(random, 3)
-    symmetry = Symmetry.generated("any")
+    symmetry = Symmetry.generate_group("any")
     assert symmetry.free
     assert not symmetry.angle_between(pose, reference).any()
     assert np.array_equal(symmetry.nearest(pose, reference)[:, 3:], reference[:, 3:])

@@ -20,8 +20,8 @@ from evermap.errors import DataError, InputError
 from evermap.geometry import se3
 from evermap.geometry.camera import project, unproject
 from evermap.io import list_robots, read_recording, reader_for
-from evermap.io.bag import bag_settings, guessed_settings, read_bag, settings_path
-from evermap.io.bag_messages import scanned
+from evermap.io.bag import bag_settings, guess_settings, read_bag, settings_path
+from evermap.io.bag_messages import scan_bag
 from evermap.io.rosbag import UNSTATED
 from evermap.types import UNKNOWN, SpatialRecording, landmark_id_of
 
@@ -90,11 +90,11 @@ def test_tags_are_where_they_are(name: str, detector: str, tmp_path: Path) -> No
 
 def test_odometry_that_is_only_in_transforms(tmp_path: Path) -> None:
     bag = write(tmp_path / "drive", "aruco")
-    content = scanned(bag)
-    assert guessed_settings(content).odometry == "/odom"
+    content = scan_bag(bag)
+    assert guess_settings(content).odometry == "/odom"
     for topic in ("/odom", "/wheels/twist"):
         del content.motion[topic]
-    assert guessed_settings(content).odometry == "tf:odom>base_link"
+    assert guess_settings(content).odometry == "tf:odom>base_link"
     settings_path(bag).write_text(bag_settings(bag).replace('"/odom"', '"tf:odom>base_link"'))
     odometry = read_bag(bag).odometry
     assert odometry is not None

@@ -15,7 +15,7 @@ from evermap.errors import InputError
 from evermap.geometry import se3
 from evermap.io.spatial import spatial_detections
 from evermap.live.engine import Now
-from evermap.live.feed import SpatialLook, SpatialPose, replayed_in_space, run_live
+from evermap.live.feed import SpatialLook, SpatialPose, replay_in_space, run_live
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap.runs.sessions import enter_session
@@ -69,7 +69,7 @@ def fed(live: em.Engine, recording: SpatialRecording) -> list[Now]:
     def refused(line: str) -> None:
         raise AssertionError(line)
 
-    run_live(live, replayed_in_space(recording), steps.append, refused)
+    run_live(live, replay_in_space(recording), steps.append, refused)
     return steps
 
 
@@ -131,7 +131,7 @@ def test_twists_are_as_good_as_the_poses_that_they_lead_to(tmp_path: Path) -> No
     by_poses = engine(tmp_path / "a.evermap", recording)
     by_twists = engine(tmp_path / "b.evermap", recording)
     steps: list[list[Now]] = [[], []]
-    readings = list(replayed_in_space(recording))
+    readings = list(replay_in_space(recording))
     poses = [one for one in readings if isinstance(one, SpatialPose)]
     count = 0
     for one in readings:

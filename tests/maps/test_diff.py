@@ -292,7 +292,9 @@ def test_over_several_revisions_only_what_was_told_is_composed(site: Path) -> No
 
 
 def assert_ends_fit(found: Difference, before: LivingMap, after: LivingMap) -> None:
-    stood, stands = (set(living.members.landmark_id[living.told_site() >= 0].tolist()) for living in (before, after))
+    stood, stands = (
+        set(living.members.landmark_id[living.find_current_site() >= 0].tolist()) for living in (before, after)
+    )
     for change in found.changes:
         came = change.kind in (APPEARED, RETURNED)
         assert all((name in stood) != came for name in change.landmark_ids), change

@@ -11,7 +11,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import multivariate_normal
 
 from evermap.geometry import se2
-from evermap.maps.bodies import USUAL, Displacements, Fate, group, log_evidence_of_motion, regrouped
+from evermap.maps.bodies import USUAL, Displacements, Fate, group, log_evidence_of_motion, regroup
 from evermap.types import FloatArray, IntArray
 from evermap_studies.sim import BuildingConfig, BuildingSimulation, simulate_building
 
@@ -23,7 +23,7 @@ def after_session(
     clique: list[int], fate: list[Fate], before: FloatArray, after: FloatArray, **options: object
 ) -> IntArray:
     """Of one class, seen to 2 cm at either time."""
-    return regrouped(
+    return regroup(
         np.array(clique), np.zeros(len(clique), dtype=np.int64), np.array(fate),
         Displacements(before, after, np.tile(2.0 * SIGMA_M**2 * np.eye(2), (len(clique), 1, 1))),
         reach_m=REACH_M, next_id=100, **options,
@@ -206,7 +206,7 @@ def pairs_in_building(seed: int, *, moves: bool = True, classes: bool = True) ->
         old, new = np.flatnonzero(known), np.flatnonzero(there & ~known)
         if moves and len(old):
             covariance = np.tile(2.0 * SIGMA_M**2 * np.eye(2), (len(old), 1, 1))
-            label[old] = regrouped(
+            label[old] = regroup(
                 label[old],
                 kind[old],
                 fate[old],

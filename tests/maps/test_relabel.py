@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap.maps.bodies import relabelled
+from evermap.maps.bodies import relabel
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.types import FloatArray
 
@@ -54,7 +54,7 @@ def joint(living: LivingMap, names: tuple[int, ...]) -> FloatArray:
 
 def test_a_body_taken_apart_keeps_its_sites_in_both_parts() -> None:
     before = a_map()
-    after, rank = relabelled(before, np.array([0, 0, 2, 1]))
+    after, rank = relabel(before, np.array([0, 0, 2, 1]))
     assert where(after) == where(before)
     np.testing.assert_array_equal(after.places.position_m[rank], before.places.position_m)
     np.testing.assert_allclose(joint(after, (1, 2, 3, 7)), joint(before, (1, 2, 3, 7)))
@@ -77,7 +77,7 @@ def test_stays_are_of_the_part_that_keeps_the_site() -> None:
     alone |= whole.places.landmark_id == 3
     corner = (2 * np.flatnonzero(alone)[:, None] + np.arange(2)).ravel()
     before = replace(whole, places=whole.places[alone], covariance_m2=whole.covariance_m2[np.ix_(corner, corner)])
-    after, _ = relabelled(before, np.array([0, 0, 2, 1]))
+    after, _ = relabel(before, np.array([0, 0, 2, 1]))
     owner = dict(zip(after.sites.site_id.tolist(), after.sites.clique_id.tolist(), strict=True))
     assert owner[1] == 2
     assert after.stays.site_id.tolist() == [1, 2]
@@ -86,7 +86,7 @@ def test_stays_are_of_the_part_that_keeps_the_site() -> None:
 
 def test_bodies_put_together_stand_where_both_stood() -> None:
     before = a_map()
-    after, _ = relabelled(before, np.zeros(4, dtype=np.int64))
+    after, _ = relabel(before, np.zeros(4, dtype=np.int64))
     assert where(after) == where(before)
     assert set(after.sites.clique_id.tolist()) == {0}
     together = after.places.site_id[after.places.landmark_id == 7][0]
@@ -101,7 +101,7 @@ def test_bodies_put_together_stand_where_both_stood() -> None:
 
 def test_the_same_cliques_are_the_same_map() -> None:
     before = a_map()
-    after, rank = relabelled(before, before.members.clique_id)
+    after, rank = relabel(before, before.members.clique_id)
     np.testing.assert_array_equal(rank, np.arange(7))
     for name in ("members", "sites", "places", "stays"):
         for column in ("site_id", "clique_id", "landmark_id", "p_here"):

@@ -15,9 +15,9 @@ import evermap as em
 from evermap.errors import InputError
 from evermap.geometry.chunked import ChunkedCovariance, of_places
 from evermap.maps.living import Dated, LivingMap
-from evermap.maps.shelves import ROWS, Shelves, columns, spliced
+from evermap.maps.shelves import ROWS, Shelves, columns, splice
 from evermap.maps.store import Provenance, RevisionKind, open_store
-from evermap.maps.vicinity import Vicinity, in_chunks, predicted_of
+from evermap.maps.vicinity import Vicinity, in_chunks, predict_sites
 from evermap.sensing.sightlines import SightLines
 from evermap.types import Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
@@ -109,7 +109,7 @@ def test_beliefs_age_from_when_somebody_was_near() -> None:
     dated = replace(living, stamp_s=later_s, dated=Dated(sites, np.full(len(sites), living.stamp_s)))
     np.testing.assert_allclose(dated.p_exists(), aged, rtol=1e-9)
     named = living.members.landmark_id[:10]
-    p_here = predicted_of(dated, named, config(whole_places=1).living, later_s)
+    p_here = predict_sites(dated, named, config(whole_places=1).living, later_s)
     touched = np.isin(sites, living.sites.site_id[np.isin(living.sites.clique_id, living.members.clique_id[:10])])
     assert np.any(p_here[touched] != living.sites.p_here[touched])
     np.testing.assert_array_equal(p_here[~touched], living.sites.p_here[~touched])
@@ -198,7 +198,7 @@ def test_shelves_are_the_table_that_is_on_them(seed: int) -> None:
     for _ in range(3):
         gone = np.unique(rng.integers(0, 300, int(rng.integers(0, 20))))
         new = lines(rng.choice(np.append(gone, [400, 401]), int(rng.integers(0, 200))))
-        table = spliced(table, np.append(gone, [400, 401]), new)
+        table = splice(table, np.append(gone, [400, 401]), new)
         shelves = shelves.replaced(np.append(gone, [400, 401]), new)
         for column in columns(table):
             np.testing.assert_array_equal(getattr(shelves.table(), column), getattr(table, column))

@@ -196,7 +196,7 @@ def spiral_stair(stamp_s, width_m=4.0, period_s=40.0, climb_mps=0.06):
     yaw = np.unwrap(np.arctan2(0.7 * np.cos(phase), -np.sin(phase)))
     sway = np.stack([0.1 * np.sin(5 * phase), 0.08 * np.cos(7 * phase)], axis=1)
     quaternion = Rotation.from_euler("ZYX", np.column_stack([yaw, sway])).as_quat()
-    return se3.normalised(np.column_stack([xyz, quaternion]))
+    return se3.normalise_poses(np.column_stack([xyz, quaternion]))
 
 
 LOOKING_AHEAD = (0.1, 0.0, 0.2, -0.5, 0.5, -0.5, 0.5)
@@ -219,8 +219,8 @@ def walls_with_tags(rng, count, height_m):
     turn = Rotation.from_euler("z", side[:, None] * np.pi / 2) * Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
     boxes = np.column_stack([[1.0, -1.5, 0.2], [0.5, -1.0, 1.6], np.full(3, 0.4)])
     yaw = Rotation.from_euler("z", [[0.3], [1.2], [-0.7]]).as_quat()
-    tags = se3.normalised(np.column_stack([at, turn.as_quat()]))
-    return np.concatenate([tags, se3.normalised(np.column_stack([boxes, yaw]))])
+    tags = se3.normalise_poses(np.column_stack([at, turn.as_quat()]))
+    return np.concatenate([tags, se3.normalise_poses(np.column_stack([boxes, yaw]))])
 
 
 def make_spatial_run(seed=0, duration_s=80.0, n_tags=16, sigma=(0.03, 0.03, 0.03, 0.01, 0.01, 0.01)):

@@ -22,7 +22,7 @@ from evermap.pipeline import run_slam
 from evermap.runs.audit import run as audit_module
 from evermap.runs.audit.drives import in_order
 from evermap.runs.audit.entries import join_drives, with_exchanges
-from evermap.runs.audit.report import audit_dict, conclude, entry_row, listed_rows, quiet_lines, write_audit
+from evermap.runs.audit.report import audit_dict, conclude, entry_row, list_rows, quiet_lines, write_audit
 from evermap.runs.audit.result import Audit, AuditEntry, EntryState
 from evermap.runs.audit.run import audit_map
 from evermap.runs.summary import RunInfo
@@ -330,7 +330,7 @@ def test_a_verdict_decides_whether_a_drive_counts(kind, causes, counts, monkeypa
     assert found.drives[0].is_heard == counts
     assert conclude(found)[0] == ("right" if counts else "untested")
     assert bool(quiet_lines(found)) == counts  # of a map that no drive judges not even 'never seen' is said
-    assert listed_rows(found) == []
+    assert list_rows(found) == []
     assert {entry.state for entry in found.entries} == {EntryState.RIGHT if counts else EntryState.UNDECIDED}
     assert found.drives[0].sensor == ("tags are 3 % smaller than stated; tag_size_m = 0.097",) * causes
 
@@ -346,7 +346,7 @@ def test_a_map_that_is_wrong_as_a_whole_says_so_and_of_no_entry_anything(factor,
     assert message.startswith("the map as a whole is wrong: ")
     assert fix in message
     assert {entry.state for entry in found.entries} == {EntryState.UNDECIDED}
-    assert (listed_rows(found), quiet_lines(found), found.corrections()) == ([], [], [])
+    assert (list_rows(found), quiet_lines(found), found.corrections()) == ([], [], [])
     assert found.drives[0].sensor == ()
 
 
@@ -403,7 +403,7 @@ def test_a_number_on_two_landmarks_is_told() -> None:
     found = audit_map(given[given.landmark_id != other], [drive])
     assert not found.corrections()
     (entry,) = [each for each in found.entries if each.landmark_id == one]
-    lines = [*quiet_lines(found), *(row[-1] for row in listed_rows(found))]
+    lines = [*quiet_lines(found), *(row[-1] for row in list_rows(found))]
     if entry.state is EntryState.RIGHT:
         assert any(line.startswith(f"{one}: right, but ") for line in lines)
     else:

@@ -38,7 +38,7 @@ from evermap.server.app import create_app
 from evermap.server.database import Database, Role
 from evermap.server.sites import SiteStores
 from evermap.server.state import Server
-from evermap.server.uploads import UploadLimits, checked_digest
+from evermap.server.uploads import UploadLimits, check_digest
 from evermap.server.worker import Worker
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -247,7 +247,7 @@ def stored(chromium: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
             for path in sorted((folder / f"day{number}").iterdir()):
                 archive.write(path, path.name)
         data = buffer.getvalue()
-        database.enqueue("ward", checked_digest(data, UploadLimits()), data, f"robot-{7 + number % 2}")
+        database.enqueue("ward", check_digest(data, UploadLimits()), data, f"robot-{7 + number % 2}")
     worker = Worker(database, sites, Config())
     while worker.step():
         pass

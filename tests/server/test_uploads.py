@@ -23,7 +23,7 @@ from evermap.config import Config, LivingConfig
 from evermap.errors import InputError
 from evermap.io.bag import bag_settings, read_bag
 from evermap.server import uploads
-from evermap.server.uploads import UploadLimits, checked_digest, recording_of
+from evermap.server.uploads import UploadLimits, check_digest, recording_of
 from evermap.types import SpatialRecording
 
 
@@ -107,9 +107,9 @@ def test_the_digest_is_of_the_session_and_not_of_the_zip(zips: list[bytes]) -> N
     other = renamed(zips[0], moved, compression=zipfile.ZIP_STORED)
     assert other != zips[0]
     assert (
-        checked_digest(other, UploadLimits())
-        == checked_digest(zips[0], UploadLimits())
-        != checked_digest(zips[1], UploadLimits())
+        check_digest(other, UploadLimits())
+        == check_digest(zips[0], UploadLimits())
+        != check_digest(zips[1], UploadLimits())
     )
 
 
@@ -133,9 +133,9 @@ ENDINGS = (".bag", ".mcap", ".db3")
 def test_a_bag_is_read_as_it_is_and_in_a_zip(bags: dict[str, Path], kind: str) -> None:
     path, limits = bags[kind], UploadLimits()
     data, wanted = path.read_bytes(), read_bag(path)
-    digest = checked_digest(data, limits)
+    digest = check_digest(data, limits)
     packed = zipped({f"monday/{path.name}": data, "monday/readme.txt": b"x"})
-    assert checked_digest(packed, limits) == digest
+    assert check_digest(packed, limits) == digest
     for one in (data, packed):
         found = recording_of(one, digest)
         assert isinstance(found, SpatialRecording)
@@ -155,7 +155,7 @@ def test_a_bag_is_read_as_it_is_and_in_a_zip(bags: dict[str, Path], kind: str) -
 def test_a_bag_of_several_files_is_read_by_its_metadata(bags: dict[str, Path]) -> None:
     folder = bags["mcap"].parent
     data = zipped({f"{folder.name}/{path.name}": path.read_bytes() for path in folder.iterdir()})
-    found = recording_of(data, checked_digest(data, UploadLimits()))
+    found = recording_of(data, check_digest(data, UploadLimits()))
     assert len(found.detections) == len(read_bag(folder).detections)
 
 
@@ -184,7 +184,7 @@ def test_a_bag_takes_no_more_than_its_share(
         with monkeypatch.context() as patched:
             patched.setattr(uploads, "_CONVERT", convert)
             with pytest.raises(InputError) as told:
-                recording_of(data, checked_digest(data, UploadLimits()))
+                recording_of(data, check_digest(data, UploadLimits()))
         return told.value.problem
 
     usual = uploads._CONVERT
@@ -203,7 +203,7 @@ def test_a_bag_takes_no_more_than_its_share(
     little = usual.replace(str(uploads._BAG_BYTES), "60000000")
     assert refused(bags["ros1"].read_bytes(), little)
     with pytest.raises(InputError, match="cannot be read as a bag"):
-        recording_of(SQLITE, checked_digest(SQLITE, UploadLimits()))
+        recording_of(SQLITE, check_digest(SQLITE, UploadLimits()))
 
 
 def test_a_refused_session_is_kept_with_its_reason(fleet: Fleet, zips: list[bytes]) -> None:
@@ -232,7 +232,7 @@ def test_tables_that_no_recording_has_are_not_unpacked(zips: list[bytes], monkey
 
     more = renamed(zips[0], lambda files: {**files, "day0/foreign.csv": bytes(3_000_000), "day0/x.toml": b"a"})
     monkeypatch.setattr(zipfile.ZipFile, "open", opened)
-    assert checked_digest(more, UploadLimits()) == checked_digest(zips[0], UploadLimits())
+    assert check_digest(more, UploadLimits()) == check_digest(zips[0], UploadLimits())
     assert read
     assert not any("foreign" in name or "x.toml" in name for name in read)
 
@@ -242,7 +242,7 @@ def test_a_session_is_unpacked_in_pieces(zips: list[bytes]) -> None:
 
     large = renamed(zips[0], lambda files: {**files, "day0/frames.csv": bytes(200_000_000)})
     tracemalloc.start()
-    checked_digest(large, UploadLimits())
+    check_digest(large, UploadLimits())
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 20_000_000
@@ -260,9 +260,9 @@ def test_few_uploads_are_unpacked_at_once(fleet: Fleet, zips: list[bytes], monke
         time.sleep(0.2)
         with lock:
             now -= 1
-        return checked_digest(data, limits)
+        return check_digest(data, limits)
 
-    monkeypatch.setattr("evermap.server.app.checked_digest", slowly)
+    monkeypatch.setattr("evermap.server.app.check_digest", slowly)
     threads = [threading.Thread(target=fleet.upload, args=(zips[0], f"site-{k}")) for k in range(6)]
     for thread in threads:
         thread.start()

@@ -26,7 +26,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap.runs.sessions import enter_session
 from evermap.server.database import MOST_TRIES, Database, JobState
-from evermap.server.uploads import UploadLimits, checked_digest, recording_of
+from evermap.server.uploads import UploadLimits, check_digest, recording_of
 from evermap.slam.cleaning import clean
 
 
@@ -59,7 +59,7 @@ def work(where: str, *more: str) -> subprocess.Popen[bytes]:
 def in_order(zips: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
     with open_store(tmp_path_factory.mktemp("order") / "m.evermap", create=True) as store:
         for data in zips[:4]:
-            entered = enter_session(store, recording_of(data, checked_digest(data, UploadLimits())))
+            entered = enter_session(store, recording_of(data, check_digest(data, UploadLimits())))
             entered.commit(store)
         return store.load()
 

@@ -9,7 +9,7 @@ import pytest
 from problems import QUIET, World, default_prior, integrated, make_world, slow_increment
 
 from evermap.geometry import se2
-from evermap.slam.bridge import bridged, dead_reckoned
+from evermap.slam.bridge import bridge_poses, dead_reckoned
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
 
@@ -45,7 +45,7 @@ def test_bridged_poses_are_the_dense_posterior(seed):
     share = rng.uniform(0.05, 0.95, len(world.problem.stamp_s) - 1)
     wanted = world.problem.stamp_s[:-1] + share * np.diff(world.problem.stamp_s)
     wanted = np.append(wanted, last + 0.9)
-    pose, covariance = bridged(
+    pose, covariance = bridge_poses(
         wanted, world.problem.stamp_s, estimate.pose, marginals.pose, marginals.consecutive,
         world.problem.drive, estimate.states, world.noise,
     )  # fmt: skip
@@ -63,7 +63,7 @@ def test_before_the_first_pose_it_is_dead_reckoning_backwards():
     world = make_world(4, prior=PLAIN)
     estimate, marginals = smoothed(world, world.truth)
     wanted, first = np.array([-0.3]), world.problem.stamp_s[0]
-    pose, covariance = bridged(
+    pose, covariance = bridge_poses(
         wanted, world.problem.stamp_s, estimate.pose, marginals.pose, marginals.consecutive,
         world.problem.drive, estimate.states, world.noise,
     )  # fmt: skip
@@ -78,7 +78,7 @@ def test_before_the_first_pose_it_is_dead_reckoning_backwards():
 def test_at_the_poses_themselves_nothing_changes():
     world = make_world(5)
     estimate, marginals = smoothed(world, world.truth)
-    pose, covariance = bridged(
+    pose, covariance = bridge_poses(
         world.problem.stamp_s, world.problem.stamp_s, estimate.pose, marginals.pose, marginals.consecutive,
         world.problem.drive, estimate.states, world.noise,
     )  # fmt: skip
@@ -91,7 +91,7 @@ def test_uncertainty_swells_in_the_middle_of_a_blind_stretch_and_stays_positive(
     estimate, marginals = smoothed(world, world.truth)
     a, b = world.problem.stamp_s[1:3]
     wanted = np.linspace(a, b, 41)
-    _, covariance = bridged(
+    _, covariance = bridge_poses(
         wanted, world.problem.stamp_s, estimate.pose, marginals.pose, marginals.consecutive,
         world.problem.drive, estimate.states, world.noise,
     )  # fmt: skip
@@ -126,11 +126,11 @@ def test_at_the_instants_of_poses_these_are_the_poses(seed):
     given = (
         own, estimate.pose, marginals.pose, marginals.consecutive, world.problem.drive, estimate.states, world.noise,
     )  # fmt: skip
-    pose, covariance = bridged(own, *given)
+    pose, covariance = bridge_poses(own, *given)
     np.testing.assert_array_equal(pose, estimate.pose)
     np.testing.assert_allclose(covariance, marginals.pose, rtol=1e-9, atol=1e-15)
     others = np.concatenate([[own[0] - 0.5], own[:-1] + 0.4 * np.diff(own), [own[-1] + 0.5]])
     every = np.sort(np.concatenate([own, others]))
-    both, alone = bridged(every, *given), bridged(others, *given)
+    both, alone = bridge_poses(every, *given), bridge_poses(others, *given)
     for all_of_them, some in zip(both, alone, strict=True):
         np.testing.assert_array_equal(all_of_them[np.isin(every, others)], some)

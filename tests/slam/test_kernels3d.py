@@ -262,4 +262,4 @@ def test_half_turns_have_one_sign(axis):
     half[3 + axis] = -1.0
     (found,) = called(compose, (se3.identity(), half), 7)
     assert np.array_equal(found, np.abs(half))
-    assert np.array_equal(se3.normalised(half), found)
+    assert np.array_equal(se3.normalise_poses(half), found)

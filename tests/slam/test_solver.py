@@ -15,7 +15,7 @@ from test_smoother import elsewhere, tied
 from evermap.config import SlamConfig
 from evermap.geometry import se2
 from evermap.slam import streaming
-from evermap.slam.batch import sighted_at
+from evermap.slam.batch import sight_at
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
 from evermap.slam.planar_filter import FrameReadings, PlanarFilter, PlanarMotion, SessionFilter
@@ -118,7 +118,7 @@ def test_a_step_from_an_optimum_leads_to_the_next(solver_of, name):
     predicted = se2.compose(before.pose[-1], motion.increment)
     last = problem.pose_row == n - 1
     landmark = before.landmark.copy()
-    pointed_at = sighted_at(predicted, problem.reading[last], before.states, problem.mount)
+    pointed_at = sight_at(predicted, problem.reading[last], before.states, problem.mount)
     new = np.isnan(landmark[problem.landmark_row[last], 0])
     landmark[problem.landmark_row[last][new]] = pointed_at[new]
     solver.add(n - 1, motion, landmark)
@@ -172,7 +172,7 @@ def test_detections_may_be_given_to_a_new_place_between_two_steps(solver_of):
     )
     motion = PlanarMotion.between(problem, world.noise, n - 1, before.states)
     predicted = se2.compose(before.pose[-1], motion.increment)
-    place = sighted_at(predicted, problem.reading[last][0], before.states, problem.mount)
+    place = sight_at(predicted, problem.reading[last][0], before.states, problem.mount)
     solver.add(n - 1, motion, np.vstack([before.landmark, place]))
     estimate = solver.estimate()
     assert estimate.known.tolist() == [True] * (count + 1)
@@ -259,7 +259,7 @@ def test_the_filter_is_the_smoother_where_all_is_nearly_linear():
             j, sigma = problem.landmark_row[m : m + 1], made.noise.of_detections(problem.sigma_given[m : m + 1])
             local.know_of(3)
             if np.isnan(local.position[j[0], 0]):
-                local.meet(int(j[0]), sighted_at(local.pose, problem.reading[m], local.states, problem.mount))
+                local.meet(int(j[0]), sight_at(local.pose, problem.reading[m], local.states, problem.mount))
             local.update(j, FrameReadings(problem.reading[m : m + 1], sigma))
     smoother = Smoother(problem, made.noise, robust=False)
     estimate = smoother.optimum(Estimate(made.truth.pose, made.truth.landmark, problem.prior.mean))

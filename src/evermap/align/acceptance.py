@@ -103,14 +103,14 @@ def accept_alignment(
     elif most - rival < rules.lead_nats:
         other = int(np.count_nonzero(ranked[order[1]][1]))
         reason = TWO_PLACES.format(standing, other, count)
-    elif (other := _mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2, source_m2)) > 0:
+    elif (other := _count_mirrored(matches, standing, most + rules.lead_nats, rules, covariance_m2, source_m2)) > 0:
         reason = (
             f"{other} of {count} landmarks fit the mirrored map, {standing} this one: bearings or an axis are reversed"
         )
     return Acceptance(motion, agree, most, most - rival, reason)
 
 
-def _mirrored(
+def _count_mirrored(
     matches: Matches,
     standing: int,
     least: float,

@@ -131,7 +131,7 @@ def rank_motions(matches: Matches, *, most: int = 2, agree_m: float = AGREE_M) -
         some = _agreeing(motion[first], table, agree_m)
         if not _determine(table, some):
             break
-        best = _refitted(motion[first], table, some)
+        best = _refit_motion(motion[first], table, some)
         if all(are_apart(best[None], other, table, agree_m)[0] for other, _ in found):
             agree = np.zeros(len(table), dtype=np.bool_)
             agree[order[some]] = True
@@ -185,7 +185,7 @@ def _determine(matches: Matches, some: IntArray) -> bool:
     return len(some) >= matches.group.point_dim or bool(matches.oriented[some].any())
 
 
-def _refitted(motion: FloatArray, matches: Matches, some: IntArray) -> FloatArray:
+def _refit_motion(motion: FloatArray, matches: Matches, some: IntArray) -> FloatArray:
     """Return the motion by the positions of all that agree, if these determine one."""
     source, target = (points[some] for points in matches.points)
     if matches.group is SPACE and (len(some) < 3 or _height(source) <= FLAT_M):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evermap.cli.options import ConfigFile, Force, Settings, argument, configured, default_out, option
+from evermap.cli.options import ConfigFile, Force, Settings, argument, configure, default_out, option
 from evermap.cli.terminal import command_line, echo, print_json, print_table, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 
@@ -65,7 +65,7 @@ def audit(
     force: Force = False,
 ) -> None:
     """Compare a map with drives, print what is wrong, and write the report."""
-    chosen = configured(config, settings, {}, within="slam", also=("living", "sensor", "track"))
+    chosen = configure(config, settings, {}, within="slam", also=("living", "sensor", "track"))
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.io import read_recording
     from evermap.io.map_formats import read_map_file, write_corrected
@@ -73,7 +73,7 @@ def audit(
         HEAD,
         conclude,
         drive_line,
-        listed_rows,
+        list_rows,
         quiet_lines,
         sensor_lines,
         write_audit,
@@ -110,7 +110,7 @@ def audit(
     if as_json:
         print_json(summary if write is None else {**summary, "written": str(write)})
     else:
-        rows = listed_rows(found)
+        rows = list_rows(found)
         if rows:
             print_table(file.path.name, rows, HEAD)
         for line in [message, *quiet_lines(found)]:

@@ -15,7 +15,7 @@ from evermap.cli.options import (
     ShowConfig,
     UnknownIds,
     argument,
-    configured,
+    configure,
     option,
 )
 from evermap.cli.terminal import (
@@ -65,7 +65,7 @@ def check(
       evermap check monday.mcap --quick
     """
     given = {"slam.unknown_ids": unknown_ids or None}
-    chosen = configured(config, settings, given, within="slam.check", also=["sensor"], show=show_config)
+    chosen = configure(config, settings, given, within="slam.check", also=["sensor"], show=show_config)
     from evermap.io import read_recording
     from evermap.runs.summary import verdict_dict
     from evermap.slam.check import check_recording

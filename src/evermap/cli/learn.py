@@ -17,7 +17,7 @@ from evermap.cli.options import (
     ShowConfig,
     Workers,
     argument,
-    configured,
+    configure,
     database_errors,
     option,
     workers_of,
@@ -74,7 +74,7 @@ def learn(
     as_json: AsJson = False,
 ) -> None:
     """Learn lifetimes over the maps of many sites."""
-    chosen = configured(config, settings, within="living", show=show_config)
+    chosen = configure(config, settings, within="living", show=show_config)
     from evermap.runs.company import Company, collect
     from evermap.runs.folder import RunFolder
 
@@ -109,7 +109,7 @@ def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> 
         found[name] = where
     if not maps and store is None:
         store = os.environ.get(STORE_VARIABLE, DEFAULT_STORE)
-    for name, where in [] if store is None else _stored(store):
+    for name, where in [] if store is None else _store_model(store):
         if name in found:
             raise ConfigError(
                 f"one of its sites is named '{name}', like a map", field="store", hint="leave out that map"
@@ -122,7 +122,7 @@ def sites_of(maps: list[str], store: str | None, cluster: str | None = None) -> 
     return {name: where if "://" in where else str(Path(where).absolute()) for name, where in found.items()}
 
 
-def _stored(store: str) -> list[tuple[str, str]]:
+def _store_model(store: str) -> list[tuple[str, str]]:
     from sqlalchemy.exc import ArgumentError
 
     from evermap.server.sites import SiteStores

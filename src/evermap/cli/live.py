@@ -24,7 +24,7 @@ from evermap.cli.options import (
     Settings,
     Topics,
     argument,
-    configured,
+    configure,
     option,
     refuse_given,
 )
@@ -98,7 +98,7 @@ def live(
     from evermap.maps.store import is_address
     from evermap.slam.plane import in_its_space
 
-    chosen = configured(config, settings, within="live", also=["slam", "living", "sensor", "output"])
+    chosen = configure(config, settings, within="live", also=["slam", "living", "sensor", "output"])
     if is_address(map_file):
         hint = "a file, and send its recordings to the server"
         raise ConfigError("must be a local file: readings are stored next to it", field="MAP", hint=hint)
@@ -136,7 +136,7 @@ def play(
     if zenoh is None and foxglove is None:
         raise ConfigError("no connection", field="zenoh", hint="--zenoh tcp/localhost:7447, or --foxglove 8765")
     recording = read_recording(input, robot=robot)
-    _check_ranges(recording, configured(None, None))
+    _check_ranges(recording, configure(None, None))
     with _connect(zenoh, foxglove, None) as wires:
         _be_the_robot(recording, wires, as_json=as_json)
 
@@ -295,7 +295,7 @@ class _Drive:
         return Engine(self.map_file, sensor, self.config, mapping=mapping, beside=beside, **about)
 
     def _readings(self, engine: Engine, shown: _Shown, *, realtime: bool) -> Iterator[Reading | None]:
-        from evermap.live.feed import replayed, replayed_in_space
+        from evermap.live.feed import replay_in_space, replayed
         from evermap.live.ros import Listener, heard, spoken
         from evermap.types import Sensor, is_in_space
 
@@ -303,7 +303,7 @@ class _Drive:
             return replayed(self.recording, paced=realtime)
         if not isinstance(engine.sensor, Sensor):
             assert self.recording is not None
-            return replayed_in_space(self.recording, paced=realtime)
+            return replay_in_space(self.recording, paced=realtime)
         self.listener = Listener(engine.sensor, self.topics, say)
         if self.recording is not None:
             return spoken(self.recording, self.listener, shown.refused, paced=realtime)
@@ -399,7 +399,7 @@ class _Shown:
         """Pose, speed, landmarks, changes."""
         if math.isnan(now.stamp_s):
             return "waiting for odometry and detections"
-        x, y, theta = _seen_from_above(now)
+        x, y, theta = _project_pose(now)
         before, self._before = self._before, (now.stamp_s, x, y)
         speed = ""
         if before is not None and now.stamp_s > before[0] and not math.isnan(x - before[1]):
@@ -413,7 +413,7 @@ _PARTS = {3: ("x_m", "y_m", "theta_rad"), 7: ("x_m", "y_m", "z_m", "qx", "qy", "
 """Numbers of a pose, in the plane and in space."""
 
 
-def _seen_from_above(now: Now) -> tuple[float, float, float]:
+def _project_pose(now: Now) -> tuple[float, float, float]:
     """Return x, y and heading."""
     if len(now.pose_world_robot) == 3:
         x, y, theta = now.pose_world_robot.tolist()

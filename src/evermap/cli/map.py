@@ -20,7 +20,7 @@ from evermap.cli.options import (
     Settings,
     Workers,
     argument,
-    configured,
+    configure,
     option,
     workers_of,
 )
@@ -339,7 +339,7 @@ def gc(
     """
     from evermap.maps.store import is_address, open_store
     from evermap.maps.store.history import ranges
-    from evermap.server.database import approved_of
+    from evermap.server.database import find_approved
 
     if not maps and store is None:  # nothing is deleted by default
         raise ConfigError("nothing to prune", field="MAP", hint="files of maps, or --store WHERE")
@@ -347,7 +347,7 @@ def gc(
     for where in sites_of(maps or [], store).values():
         with open_store(where) as opened:
             at = opened.where
-            approved = approved_of(where if is_address(where) else at)
+            approved = find_approved(where if is_address(where) else at)
             found = opened.prune(keep, also=[] if approved is None else [approved], dry_run=dry_run)
         item = {"map": at, "pruned": [*found.revisions], "kept": [*found.kept], "approved": approved}
         told.append({**item, "dry_run": dry_run, "parts": found.n_chunks, "bytes": found.n_bytes})
@@ -413,7 +413,7 @@ def reenter(
       evermap map reenter --store postgresql://evermap@db/fleet --workers tcp://scheduler:8786 --out /shared/reentered
     """
     count, cluster = workers_of(workers)
-    chosen = configured(config, settings) if config or settings else None
+    chosen = configure(config, settings) if config or settings else None
     from evermap.runs.company import reenter_all
 
     sites = sites_of(maps or [], store, cluster)

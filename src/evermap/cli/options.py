@@ -99,7 +99,7 @@ def workers_of(text: str | None) -> tuple[int | None, str | None]:
     return count, None
 
 
-def configured(
+def configure(
     path: Path | None,
     settings: Sequence[str] | None,
     values: Mapping[str, Any] | None = None,

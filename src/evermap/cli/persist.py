@@ -18,7 +18,7 @@ from evermap.cli.options import (
     TableOut,
     Workers,
     argument,
-    configured,
+    configure,
     default_out,
     option,
     priors_by_class,
@@ -100,7 +100,7 @@ def persist(
     """Filter a table of looks and write the folder of the run."""
     common, by_class = priors_by_class(prior)
     given = {"prior": common, "class_priors": by_class}
-    chosen = configured(config, settings, given, within="persist", show=show_config).persist
+    chosen = configure(config, settings, given, within="persist", show=show_config).persist
     if prior and not chosen.stays_once:
         hint = "without --set recurrent and model"
         raise ConfigError("a lifetime prior is for features that stay once", field="prior", hint=hint)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from evermap.cli.options import argument, configured, default_out, option
+from evermap.cli.options import argument, configure, default_out, option
 from evermap.cli.terminal import command_line, echo, print_json, print_table, say, warn
 from evermap.errors import ConfigError
 
@@ -112,8 +112,8 @@ def ask(
 
     Args:
         paths: recordings.
-        config: as of `configured`.
-        settings: as of `configured`.
+        config: as of `configure`.
+        settings: as of `configure`.
         unknown_ids: set `slam.unknown_ids`.
         show: print the configuration and exit.
         prior_map: 'truth', or a file; with or without `,sigma=M`.
@@ -121,7 +121,7 @@ def ask(
         given: further fields.
     """
     flags = {"unknown_ids": unknown_ids or None}
-    chosen = configured(config, settings, flags, within="slam", also=_SECTIONS, show=show)
+    chosen = configure(config, settings, flags, within="slam", also=_SECTIONS, show=show)
     set_here = [*(settings or []), *(["slam.unknown_ids="] if unknown_ids else [])]
     shifts = []
     if shift:

@@ -27,7 +27,7 @@ from evermap.cli.options import (
     Settings,
     VerbGroup,
     argument,
-    configured,
+    configure,
     database_errors,
     option,
 )
@@ -345,7 +345,7 @@ def work(
     kept(os.curdir, "a session in work returns to the queue")
     with suppress(OSError):
         os.nice(10)  # who asks the server goes first, also while this one loads its code
-    chosen = configured(config, settings)
+    chosen = configure(config, settings)
     database = _database(store)
     from evermap.server.sites import SiteStores
     from evermap.server.worker import Worker, end_without

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Settings, ShowConfig, argument, configured, duration_s, option
+from evermap.cli.options import AsJson, ConfigFile, Settings, ShowConfig, argument, configure, duration_s, option
 from evermap.cli.terminal import check_picture, print_json, print_table, progress_bar, say, warn, write_picture
 from evermap.errors import ConfigError
 
@@ -145,7 +145,7 @@ def fit(
 ) -> None:
     """Estimate lifetime distributions from censored lifetimes."""
     given = {"by": by, "estimator": estimator, "chunk_m": chunk_m}
-    chosen = configured(config, settings, given, within="survival", show=show_config).survival
+    chosen = configure(config, settings, given, within="survival", show=show_config).survival
     from evermap.runs.folder import check_output_file
     from evermap.runs.track.lifetimes import BY_CHUNK, check_estimator, estimates, groups_of, parse_by, read_lifetimes
 
@@ -218,7 +218,7 @@ def learn(
 ) -> None:
     """Learn the durations of stays and absences."""
     given = {"recurrent": recurrent, "per": per, "p_miss": p_miss, "p_false": p_false}
-    chosen = configured(config, settings, given, within="persist", show=show_config).persist
+    chosen = configure(config, settings, given, within="persist", show=show_config).persist
     if recurrent is None and chosen.stays_once:  # there is nothing to learn of one stay
         chosen = chosen.model_copy(update={"recurrent": "auto"})
     if figure is not None:
@@ -241,7 +241,7 @@ def learn(
         print_json({"out": str(out), **learned.to_dict(), "config": {"persist": chosen.to_dict()}})
         return
     for name, choice in zip(learned.models.names, learned.choices, strict=True):
-        print_table(name or input.name, _learned_lines(choice))
+        print_table(name or input.name, _format_learned(choice))
     say(f"written to {out}; use it with: evermap persist INPUT --set model={out}")
 
 
@@ -320,7 +320,7 @@ def _ages_with_data(numbers: Mapping[str, Any], prior: LifetimePrior) -> str:
     return f"{duration_text(from_s)} to {until}; that {100.0 * share:.3g} % leave before is supposed, not seen"
 
 
-def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
+def _format_learned(choice: Choice) -> list[tuple[str, str]]:
     """Return the lines on a model for people."""
     import numpy as np
 

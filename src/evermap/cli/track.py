@@ -16,7 +16,7 @@ from evermap.cli.options import (
     ShowConfig,
     TableOut,
     argument,
-    configured,
+    configure,
     default_out,
     option,
     priors_by_class,
@@ -106,7 +106,7 @@ def track(
     """Follow the objects of a table of detections and write the folder of the run."""
     common, by_class = priors_by_class(prior)
     given = {"range_m": range_m, "prior": common, "class_priors": by_class}
-    whole = configured(config, settings, given, within="track", also=("output.rerun",), show=show_config)
+    whole = configure(config, settings, given, within="track", also=("output.rerun",), show=show_config)
     if input is None:
         hint = "evermap init detections detections.csv writes an example"
         raise ConfigError("a table is needed", field="input", hint=hint)

@@ -86,7 +86,7 @@ def warm_up(
     with shared_with("evermap.cli.warmup"):  # about half of the time here, the other half at the end of this file
         warmup.filtered()
         if search or sessions:
-            warmup.searched()
+            warmup.search_changes()
         log_death_odds((GeneralPurpose(1e-8, 1.0),), np.zeros(1, dtype=np.int64), np.zeros(1), np.ones(1))
     if unknown_ids:
         from evermap.slam.association.particles import warm_up as of_the_particles

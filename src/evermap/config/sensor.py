@@ -107,7 +107,7 @@ class SensorConfig(Section):
         None, "standard deviation of the driving direction relative to the front [rad]", ge=0, le=6.3
     )
 
-    def applied_to(self, sensor: Sensor) -> Sensor:
+    def apply_to(self, sensor: Sensor) -> Sensor:
         """Return the recording's sensor with the fields that are set here; ConfigError if then nothing can be in
         view.
         """
@@ -118,7 +118,7 @@ class SensorConfig(Section):
                 raise ConfigError(problem, field=f"sensor.{low}")
         return merged
 
-    def applied_in_space(self, sensors: Sequence[SpatialSensor]) -> tuple[SpatialSensor, ...]:
+    def apply_in_space(self, sensors: Sequence[SpatialSensor]) -> tuple[SpatialSensor, ...]:
         """Return the sensors of a recording in space with the fields that are set here, each the same.
 
         Raises:

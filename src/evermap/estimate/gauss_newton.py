@@ -52,7 +52,7 @@ class Minimum(Generic[State]):
     factorised: Factorised | None
 
 
-def minimised(graph: Graph[State], start: State, steps: Steps, now: Linear | None = None) -> Slices[Minimum[State]]:
+def minimise(graph: Graph[State], start: State, steps: Steps, now: Linear | None = None) -> Slices[Minimum[State]]:
     """Run damped Gauss-Newton from `start`, in slices.
 
     Args:

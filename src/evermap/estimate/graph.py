@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.estimate.sparse.elimination import curvature, multiply_rows
-from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
+from evermap.estimate.sparse.system import Factorised, Slices, System, exhaust
 from evermap.estimate.sparse.tree import MS, Factors, tree_of
 from evermap.types import FloatArray, IntArray
 
@@ -233,7 +233,7 @@ class Graph(Generic[State]):
         for k, block in blocks.items():
             at = self.structure.values_of(k)
             values[at], weights[k] = 0.0, np.ones(len(weights[k]))
-            exhausted(block.linearise(state, Room(values[at], weights[k])))
+            exhaust(block.linearise(state, Room(values[at], weights[k])))
         return replace(now, values=values, weights=tuple(weights))
 
     def factorised(self, now: Linear, damping: float = 0.0) -> Slices[Factorised]:

@@ -116,7 +116,7 @@ class MeasurementKind:
         return {name: np.full(count, value, dtype=np.float64) for name, value in self.optional.items()} | dict(columns)
 
 
-def stacked(columns: Columns, *names: str) -> FloatArray:
+def stack_columns(columns: Columns, *names: str) -> FloatArray:
     """Return (K, n) some columns beside each other."""
     return np.column_stack([columns[name] for name in names])
 

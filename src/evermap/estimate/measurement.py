@@ -13,7 +13,7 @@ from typing import Generic, Protocol
 import numpy as np
 
 from evermap.estimate.graph import Room, State, State_contra
-from evermap.estimate.kind import Columns, MeasurementKind, stacked
+from evermap.estimate.kind import Columns, MeasurementKind, stack_columns
 from evermap.estimate.robust import HEAVY_TAIL, weigh
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se3
@@ -164,7 +164,7 @@ class MeasurementFactors(Generic[State]):
         elif tied.kind.ties == "pose_place":
             other = view.places(state)[tied.other]
         found = tied.kind.linearise(pose, other, tied.columns)
-        weight = 1.0 / stacked(tied.columns, *tied.kind.sigma)
+        weight = 1.0 / stack_columns(tied.columns, *tied.kind.sigma)
         measured = np.isfinite(found.residual) & np.isfinite(weight)
         weight = np.where(measured, weight, 0.0)[..., None]
         residual = np.where(measured, found.residual, 0.0) * weight[..., 0]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Generic
 
-from evermap.estimate.gauss_newton import Minimum, Steps, minimised
+from evermap.estimate.gauss_newton import Minimum, Steps, minimise
 from evermap.estimate.graph import Graph, Linear, State
-from evermap.estimate.sparse.system import Factorised, Slices, exhausted
+from evermap.estimate.sparse.system import Factorised, Slices, exhaust
 
 
 class Solver(ABC, Generic[State]):
@@ -22,9 +22,9 @@ class Solver(ABC, Generic[State]):
 
     def graph(self, state: State) -> Graph[State]:
         """Return what `graph_in_slices` does."""
-        return exhausted(self.graph_in_slices(state))
+        return exhaust(self.graph_in_slices(state))
 
-    def linearised_in_slices(self, state: State) -> Slices[Linear]:
+    def linearise_in_slices(self, state: State) -> Slices[Linear]:
         """Return the problem linearised at `state`; the last one is kept."""
         if self._last is not None and self._last[0] is state:
             return self._last[1]
@@ -34,28 +34,28 @@ class Solver(ABC, Generic[State]):
         return now
 
     def linearised(self, state: State) -> Linear:
-        """Return what `linearised_in_slices` does."""
-        return exhausted(self.linearised_in_slices(state))
+        """Return what `linearise_in_slices` does."""
+        return exhaust(self.linearise_in_slices(state))
 
-    def minimised_in_slices(self, start: State, steps: Steps) -> Slices[Minimum[State]]:
-        """Run damped Gauss-Newton from `start`, in slices: `gauss_newton.minimised`.
+    def minimise_in_slices(self, start: State, steps: Steps) -> Slices[Minimum[State]]:
+        """Run damped Gauss-Newton from `start`, in slices: `gauss_newton.minimise`.
 
         Raises:
             NumericalError: no finite optimum.
         """
         graph = yield from self.graph_in_slices(start)
-        now = yield from self.linearised_in_slices(start)
-        solution = yield from minimised(graph, start, steps, now)
+        now = yield from self.linearise_in_slices(start)
+        solution = yield from minimise(graph, start, steps, now)
         self._last = (solution.state, solution.now)
         return solution
 
-    def factorised_in_slices(self, state: State) -> Slices[Factorised]:
+    def factorise_in_slices(self, state: State) -> Slices[Factorised]:
         """Return the normal equations at `state` with all but the border eliminated.
 
         Raises:
             NumericalError: the measurements do not determine a solution.
         """
-        now = yield from self.linearised_in_slices(state)
+        now = yield from self.linearise_in_slices(state)
         graph = yield from self.graph_in_slices(state)
         return (yield from graph.factorised(now))
 

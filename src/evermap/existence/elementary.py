@@ -24,7 +24,7 @@ parallel_kernel = kept(error_model="numpy", parallel=True)
 """With its `prange` loops spread over the threads."""
 
 
-def _aligned_stack(_typing: Any) -> Any:
+def _align_stack(_typing: Any) -> Any:
     """Called at the top of a kernel with long loops: the vector registers that it spills start on cache lines.
 
     LLVM decides whether to align the stack before it knows that it will spill 64-byte registers, and then each spill
@@ -39,11 +39,11 @@ def _aligned_stack(_typing: Any) -> Any:
     return types.void(), generate
 
 
-aligned_stack: Any = intrinsic(_aligned_stack)
+aligned_stack: Any = intrinsic(_align_stack)
 
 
 @inlined
-def _reduced(x: Any) -> Any:
+def _reduce_exponent(x: Any) -> Any:
     """`e^x = power * (1 + p)`, `power` a power of 2: reduction by ln 2 (Cody and Waite), minimax polynomial (1e-17)."""
     shifted = x * 1.4426950408889634 + 6755399441055744.0  # adding 1.5 * 2^52 rounds to a whole number
     whole = shifted - 6755399441055744.0
@@ -65,14 +65,14 @@ def _reduced(x: Any) -> Any:
 @inlined
 def expm1(x: Any) -> Any:
     """Return `e^x - 1` for |x| <= 700."""
-    power, p = _reduced(x)
+    power, p = _reduce_exponent(x)
     return power * p + (power - 1.0)
 
 
 @inlined
 def exp(x: Any) -> Any:
     """Return `e^x` for |x| <= 700, to the last digit also where it is small."""
-    power, p = _reduced(x)
+    power, p = _reduce_exponent(x)
     return power * p + power
 
 

@@ -18,7 +18,7 @@ from evermap.existence.recursion import RowLooks, RowState
 from evermap.types import FloatArray, IntArray
 
 
-def _compiled_formulas() -> dict[str, Any]:
+def _compile_formulas() -> dict[str, Any]:
     """The formulas of `recursion`, inlined into the kernels that call them, with exponentials that are not calls."""
     space = dict(vars(recursion))
     for name, formula in vars(recursion).items():
@@ -29,7 +29,7 @@ def _compiled_formulas() -> dict[str, Any]:
     return space
 
 
-_FORMULAS = _compiled_formulas()
+_FORMULAS = _compile_formulas()
 aged, observed, weighed = _FORMULAS["aged"], _FORMULAS["observed"], _FORMULAS["weighed"]
 odds_of, gap_odds = _FORMULAS["odds_of"], _FORMULAS["gap_odds"]
 scaled_survival = _FORMULAS["scaled_survival"]

@@ -215,8 +215,7 @@ def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int, to
     fitted: tuple[Fitted, Fitted] | None = None
     for number in range(rounds):
         ranked = [
-            ranked_fits(expected.counts[s], allowed[s], fitted[s] if fitted else None, rhythm=data.rhythm)
-            for s in (0, 1)
+            rank_fits(expected.counts[s], allowed[s], fitted[s] if fitted else None, rhythm=data.rhythm) for s in (0, 1)
         ]
         fitted = (ranked[0][0], ranked[1][0])
         allowed = [_promising(fits, expected.counts[s]) for s, fits in enumerate(ranked)]
@@ -236,7 +235,7 @@ def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int, to
     return best
 
 
-def ranked_fits(counts: Sojourns, families: Sequence[str], start: Fitted | None, *, rhythm: bool) -> list[Fitted]:
+def rank_fits(counts: Sojourns, families: Sequence[str], start: Fitted | None, *, rhythm: bool) -> list[Fitted]:
     """Return lifetimes of some families, the highest score first."""
     known = WITH_RHYTHM if rhythm else FAMILIES
     fits = [known[name](counts, start if start and start.family == name else None) for name in families]
@@ -307,10 +306,12 @@ class LearnedSojourns(Shown):
         if rhythm:
             of_kind, data, unusual = data.days(self.model, fade * self.of_kind)
         new = data.expect(replace(self.model, unusual=None))
-        absences, stays = (_added(old, more, fade) for old, more in zip(self.expected.counts, new.counts, strict=True))
+        absences, stays = (
+            _add_counts(old, more, fade) for old, more in zip(self.expected.counts, new.counts, strict=True)
+        )
         fitted = (
-            ranked_fits(absences, self.families, None, rhythm=rhythm)[0],
-            ranked_fits(stays, self.families, None, rhythm=rhythm)[0],
+            rank_fits(absences, self.families, None, rhythm=rhythm)[0],
+            rank_fits(stays, self.families, None, rhythm=rhythm)[0],
         )
         return replace(
             self,
@@ -352,7 +353,7 @@ def learn(
         ConfigError: a family that does not exist.
         DataError: no feature with two looks at different times.
     """
-    allowed = _allowed(families, rhythm=rhythm)
+    allowed = _list_allowed(families, rhythm=rhythm)
     step = step_s or looks.median_gap_s()
     steady = Data.of(looks, step, half_life_s, rhythm=False)
     data = Data.of(looks, step, half_life_s, rhythm=True) if rhythm else steady
@@ -408,7 +409,7 @@ def _with_unusual_days(data: Data, best: Ascent) -> tuple[Ascent, FloatArray, Da
     return again, of_kind, shares
 
 
-def _allowed(families: Sequence[str] | None, *, rhythm: bool) -> tuple[str, ...]:
+def _list_allowed(families: Sequence[str] | None, *, rhythm: bool) -> tuple[str, ...]:
     """Return the families to choose from."""
     known = WITH_RHYTHM if rhythm else FAMILIES
     allowed = tuple(known if families is None else families)
@@ -436,7 +437,7 @@ def _exponential(data: Data, hypotheses: int, restarts: int, tell: Progress) -> 
     return found
 
 
-def _added(old: Sojourns, new: Sojourns, fade: float) -> Sojourns:
+def _add_counts(old: Sojourns, new: Sojourns, fade: float) -> Sojourns:
     """Counts of two recordings, the older faded."""
     return Sojourns(
         old.edge_s,

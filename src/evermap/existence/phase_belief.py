@@ -67,7 +67,7 @@ class PhaseBelief(RecurrentBeliefTable):
     def _presence(self, index: IntArray, time: FloatArray) -> FloatArray:
         return self._present(self._at(index, time))
 
-    def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
+    def _look(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
         weighed = self._at(index, time) * np.where(self.model.present, there[:, None], gone[:, None])
         likelihood = weighed.sum(1)
         check_possible(np.where(likelihood > 0.0, likelihood, np.nan), index)

@@ -386,7 +386,7 @@ class BeliefTable(Shown, ABC):
         """Return (K,) probability of presence of some rows at later times."""
 
     @abstractmethod
-    def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
+    def _look(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
         """Return beliefs after a look at each of some rows, of these likelihoods if it is there and if it is not."""
 
     def predict(self, stamp_s: Any, *, rows: Any = None) -> FloatArray:
@@ -420,11 +420,11 @@ class BeliefTable(Shown, ABC):
             NumericalError: a look that is impossible, whether the feature is there or not.
         """
         columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
-        index, (time, hit, miss, false) = self._looked_at(rows, columns)
+        index, (time, hit, miss, false) = self._choose_rows(rows, columns)
         check_looks(time, hit, miss, false, self.stamp_s[index], index)
-        return self._looked(index, time, *likelihoods(hit, miss, false))
+        return self._look(index, time, *likelihoods(hit, miss, false))
 
-    def _looked_at(self, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
+    def _choose_rows(self, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
         """The rows looked at, and their part of each column; the first column is the times."""
         index = np.arange(len(self)) if rows is None else check_rows(rows, len(self))
         return index, [as_rows(column, len(index), field) for field, column in columns.items()]

@@ -217,11 +217,11 @@ def week_basis(bins_of_day: int = BINS_OF_DAY, knots: int = DAY_KNOTS) -> Basis:
 
     rough = _cyclic_difference(DEVIATION_KNOTS) + 0.05 * np.eye(DEVIATION_KNOTS)
     penalties = (
-        _padded(_cyclic_difference(knots), int(starts[0]), size),
-        _padded(np.eye(7), int(starts[2]), size),
-        _padded(np.asarray(np.kron(np.eye(7), rough), dtype=np.float64), int(starts[3]), size),
+        _pad_matrix(_cyclic_difference(knots), int(starts[0]), size),
+        _pad_matrix(np.eye(7), int(starts[2]), size),
+        _pad_matrix(np.asarray(np.kron(np.eye(7), rough), dtype=np.float64), int(starts[3]), size),
     )
-    return Basis(columns, penalties, _padded(np.array([[_WEEKEND]]), int(starts[1]), size))
+    return Basis(columns, penalties, _pad_matrix(np.array([[_WEEKEND]]), int(starts[1]), size))
 
 
 def steady_level(n: int) -> Basis:
@@ -250,11 +250,11 @@ def fit(
     counted = events + HALF_AN_EVENT * exposure / total
     columns_week = week.columns if week else np.zeros((exposure.shape[1], 0))
     p, q = age.columns.shape[1], columns_week.shape[1]
-    penalties = [_padded(penalty, 0, p + q) for penalty in age.penalties]
-    fixed = WEAK * np.eye(p + q) + _padded(age.fixed, 0, p + q)
+    penalties = [_pad_matrix(penalty, 0, p + q) for penalty in age.penalties]
+    fixed = WEAK * np.eye(p + q) + _pad_matrix(age.fixed, 0, p + q)
     if week:
-        penalties += [_padded(penalty, p, p + q) for penalty in week.penalties]
-        fixed += _padded(week.fixed, p, p + q)
+        penalties += [_pad_matrix(penalty, p, p + q) for penalty in week.penalties]
+        fixed += _pad_matrix(week.fixed, p, p + q)
     weights = np.ones(len(penalties))
     beta = np.concatenate([np.full(p, np.log(counted.sum() / total)), np.zeros(q)])
     if start is not None and len(start.coefficients) == p + q:
@@ -332,7 +332,7 @@ def _newton(
     return beta, np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _padded(matrix: FloatArray, start: int, size: int) -> FloatArray:
+def _pad_matrix(matrix: FloatArray, start: int, size: int) -> FloatArray:
     """`matrix` on the diagonal of a larger matrix of zeros."""
     whole = np.zeros((size, size))
     whole[start : start + len(matrix), start : start + len(matrix)] = matrix

@@ -290,7 +290,7 @@ class RunLengthBelief(RecurrentBeliefTable):
         predict_rows(index, self.rows, time, self.model.law, belief)
         return belief
 
-    def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
+    def _look(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
         from evermap.existence.run_length_kernels import look_rows
 
         names = ("start_s", "weight", "count", "stamp_s", "log_evidence", "merged_mass")

@@ -114,7 +114,7 @@ def age_bin(age_s: Any, law: Any) -> Any:
 
 
 @inlined
-def _integrated(age: Any, later: Any, s: Any, law: Any) -> Any:
+def _integrate_state(age: Any, later: Any, s: Any, law: Any) -> Any:
     """Integral of the hazard of state `s` between two ages."""
     i, j = age_bin(age, law), age_bin(later, law)
     levels = law.intercept[s, j] - law.intercept[s, i]
@@ -146,7 +146,7 @@ def _hazards(start: Any, n: Any, s: Any, now: Any, later: Any, law: Any, hazard:
     A loop of its own: one that looks up a table keeps a compiler from using vectors for the exponentials.
     """
     for j in range(n):
-        hazard[s, j] = _integrated(now - start[s, j], later - start[s, j], s, law)
+        hazard[s, j] = _integrate_state(now - start[s, j], later - start[s, j], s, law)
 
 
 @inlined

@@ -52,9 +52,9 @@ class Belief(BeliefTable):
         with np.errstate(divide="ignore"):
             return np.asarray(-np.log(self.inverse_odds), dtype=np.float64)
 
-    def _looked_at(self, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
+    def _choose_rows(self, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
         """A row whose time is NaN was not looked at."""
-        index, values = super(Belief, self)._looked_at(rows, columns)
+        index, values = super(Belief, self)._choose_rows(rows, columns)
         looked = ~np.isnan(values[0])
         return (index, values) if looked.all() else (index[looked], [column[looked] for column in values])
 
@@ -76,11 +76,11 @@ class Belief(BeliefTable):
             NumericalError: an observation that is impossible under both states.
         """
         columns = {"stamp_s": stamp_s, "log_there": log_there, "log_gone": log_gone}
-        index, (time, there, gone) = self._looked_at(rows, columns)
+        index, (time, there, gone) = self._choose_rows(rows, columns)
         checks.check_times(time, self.stamp_s[index], index)
         checks.check_log_likelihood(there, "log_there", index)
         checks.check_log_likelihood(gone, "log_gone", index)
-        return self._looked(index, time, there, gone, logs=True)
+        return self._look(index, time, there, gone, logs=True)
 
     def run(self, feature: Any, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any) -> tuple[Self, FloatArray]:
         """Apply a stream of observations in one call, in any order of rows.
@@ -110,7 +110,7 @@ class Belief(BeliefTable):
         entry, time = entry[order], time[order]
         same = np.append(False, entry[1:] == entry[:-1])[: len(entry)]
         before = np.where(same, np.append(0.0, time[:-1])[: len(entry)], self.stamp_s[entry])
-        after, posterior, bad = self._streamed(entry, before, time, there, gone, logs=False)
+        after, posterior, bad = self._stream_looks(entry, before, time, there, gone, logs=False)
         if bad >= 0:
             raise checks.impossible(f"row {int(order[bad])} (feature {entry[bad]} at {time[bad]} s)")
         unsorted = np.empty(len(entry))
@@ -125,16 +125,16 @@ class Belief(BeliefTable):
         predict_rows(self.inverse_odds[index], odds, predicted)
         return 1.0 / (1.0 + predicted)
 
-    def _looked(
+    def _look(
         self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray, *, logs: bool = False
     ) -> Self:
         """Return beliefs after looks at some rows, of these likelihoods or their logarithms."""
-        after, _, bad = self._streamed(index, self.stamp_s[index], time, there, gone, logs=logs)
+        after, _, bad = self._stream_looks(index, self.stamp_s[index], time, there, gone, logs=logs)
         if bad >= 0:
             raise checks.impossible(f"row {index[bad]}")
         return after
 
-    def _streamed(
+    def _stream_looks(
         self, row: IntArray, before_s: FloatArray, time: FloatArray, there: FloatArray, gone: FloatArray, logs: bool
     ) -> tuple[Self, FloatArray, int]:
         """Return beliefs after M looks, (M,) probabilities unless `logs`, and the first impossible look or -1."""

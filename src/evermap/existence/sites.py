@@ -417,7 +417,7 @@ def follow_sites(
     chains = CliqueChains.of(clique_of_site, n_cliques)
     frames = CliqueFrames.of(looks, n_cliques, until_s)
     old = chains.start(p_here, pinned)
-    chain, new, came_s = _predicted(chains, frames, dynamics, old, start, pinned)
+    chain, new, came_s = _predict_looks(chains, frames, dynamics, old, start, pinned)
     with np.errstate(divide="ignore"):
         log_here = np.log(np.column_stack([old, new]))
     shape = chain.log_rest.shape
@@ -443,7 +443,7 @@ def follow_sites(
     return SiteBeliefs(stayed + returned, stayed, before, since_s, weight, log_evidence, trace)
 
 
-def _predicted(
+def _predict_looks(
     chains: CliqueChains,
     frames: CliqueFrames,
     dynamics: SiteDynamics,

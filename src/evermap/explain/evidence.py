@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from evermap.estimate.graph import Graph, Linear
-from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.estimate.sparse.system import Factorised, exhaust
 from evermap.explain.causes.odometry import TURN
 from evermap.explain.causes.suspect import SCALE, USUAL_P
 from evermap.slam import intake
@@ -107,7 +107,7 @@ class ScalePrior(NamedTuple):
     """What is meant of a scale that is a calibration state: it is as stated, or as is usual, or a cause has changed it.
 
     The prior that a solution was found with says less: its mean and width are chosen so that the estimate is the mean
-    over the first two (`slam.calibration.narrowed`), and wide enough for a map in another metre.
+    over the first two (`slam.calibration.narrow`), and wide enough for a map in another metre.
 
     Attributes:
         row: number of the border.
@@ -152,7 +152,7 @@ class Optimum:
     @cached_property
     def solved(self) -> Factorised:
         """The normal equations there, factorised once for all that is asked of them."""
-        return exhausted(self.graph.factorised(self.now))
+        return exhaust(self.graph.factorised(self.now))
 
 
 def log_evidence(session: AnySession, changes: tuple[MapChange, ...] = ()) -> float:
@@ -222,7 +222,7 @@ def weigh_levels(session: AnySession) -> float:
     return gain_without_start(outcome.problem, values, outcome.fit_marginals, inlier, outcome.noise.noise, start)
 
 
-def used_rows(session: AnySession) -> IntArray:
+def list_used_rows(session: AnySession) -> IntArray:
     """Return (M,) rows of the recording's detections that a session used, in the order of its problem."""
     return session.prepared.used if isinstance(session, Solved) else session.intake.used
 
@@ -413,7 +413,7 @@ class Column(NamedTuple):
 
     def step(self) -> FloatArray:
         """Return (numbers,) by which a unit of it moves all others."""
-        return exhausted(self.solved.solution())
+        return exhaust(self.solved.solution())
 
 
 @dataclass(frozen=True)
@@ -464,7 +464,7 @@ class Screen:
         """
         graph, state = self.optimum.graph, self.optimum.state
         there, _ = graph.retract(state, TINY * value * column.step())
-        residual = residuals_of(graph, exhausted(graph.linearised(there)))[0]
+        residual = residuals_of(graph, exhaust(graph.linearised(there)))[0]
         return np.asarray(column.told + (residual - self.residual) * self.root / (TINY * value))
 
     def variance(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import EvermapError
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.explain.causes.suspect import Inputs, Suspect
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Optimum, Screen, SpatialSession, residuals_of
 from evermap.geometry import se2, se3
@@ -18,7 +18,7 @@ from evermap.slam.intake import place_map, prepare_alike
 from evermap.slam.problem import Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.space.bridge import PathFrames
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.intake import SpatialIntake, drive_through, find_corners, lead_on, prepare_space
 from evermap.slam.space.problem import PlacePrior, SpatialProblem, Swing
 from evermap.slam.space.smoother import SpatialSmoother
@@ -40,7 +40,7 @@ STEPS_NEARBY = 10
 """Gauss-Newton steps to the optimum nearby under a continuous cause, at most."""
 
 
-def held_by_map(session: AnySession) -> AnySession:
+def hold_by_map(session: AnySession) -> AnySession:
     """Return a session in space at the optimum at which all landmarks of the map stand; others as they are.
 
     What moves explain is hidden: a map that was let go says nothing of a scale.
@@ -52,7 +52,7 @@ def held_by_map(session: AnySession) -> AnySession:
     if not len(problem.prior.place) or problem.prior.weight.min() > problem.settings.inlier:
         return session
     prior = replace(problem.prior, weight=np.ones_like(problem.prior.weight))
-    held = converged(replace(problem, prior=prior), optimum.estimate, optimum.noise)
+    held = converge(replace(problem, prior=prior), optimum.estimate, optimum.noise)
     return SpatialSession(session.intake, replace(session.solved, optimum=held))
 
 
@@ -183,7 +183,7 @@ def _residuals_in_space(session: SpatialSession, optimum: Optimum, inputs: Input
     # where two are as long; and no weight is 0 with tails that never let go
     fixed = replace(moved, swing=before)
     smoother = SpatialSmoother(fixed, solved.estimate.pose, optimum.graph.structure)
-    now = exhausted(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
+    now = exhaust(smoother.graph(solved.noise, heavy=True).linearised(solved.estimate))
     return residuals_of(optimum.graph, now)[0]
 
 

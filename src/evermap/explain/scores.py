@@ -27,7 +27,7 @@ from evermap.explain.causes.lenses import FOCAL
 from evermap.explain.causes.odometry import DELAY_S, turn_less
 from evermap.explain.causes.suspect import LITTLE, RARE_P, USUAL_P, Inputs, Suspect
 from evermap.explain.evidence import DETECTIONS, ODOMETRY, AnySession, Column, Optimum, Screen, optimum_of, residuals_of
-from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion, held_by_map
+from evermap.explain.linearise import FINE_STEP, change_by, change_by_motion, hold_by_map
 from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray, SpatialRecording, Trajectory, is_in_space
 
@@ -140,8 +140,8 @@ class ScreenedSession:
 
     @cached_property
     def held(self) -> ScreenedSession:
-        """The session at the optimum at which all landmarks of the map stand: `held_by_map`."""
-        held = held_by_map(self.session)
+        """The session at the optimum at which all landmarks of the map stand: `hold_by_map`."""
+        held = hold_by_map(self.session)
         return self if held is self.session else ScreenedSession(held, self.inputs)
 
 

@@ -20,9 +20,9 @@ from evermap.explain.evidence import (
     Screen,
     SpatialSession,
     evidence_at,
+    list_used_rows,
     optimum_of,
     price_changes,
-    used_rows,
 )
 from evermap.explain.linearise import change_by, cost_nearby, gain_by, solve_nearby
 from evermap.explain.scores import ScreenedSession
@@ -307,7 +307,7 @@ def screen_continuous(
 
 def _of_one(screen: Screen, session: AnySession, inputs: Inputs, suspect: Suspect) -> BoolArray:
     """Return (R,) which residuals are of the detections that a cause is of."""
-    return screen.of_detections(rows_of_kind(inputs.recording, suspect.rows)[used_rows(session)])
+    return screen.of_detections(rows_of_kind(inputs.recording, suspect.rows)[list_used_rows(session)])
 
 
 def _may_relieve(session: AnySession, inputs: Inputs, suspect: Suspect, state: float, rules: ExplainConfig) -> bool:

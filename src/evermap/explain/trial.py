@@ -16,9 +16,9 @@ from evermap.explain.evidence import (
     AnySession,
     Score,
     evidence_at,
+    list_used_rows,
     price_changes,
     price_scales,
-    used_rows,
     weigh_levels,
 )
 from evermap.explain.linearise import change_by
@@ -276,7 +276,7 @@ def _state_evidence(taken: Taken) -> float:
 def weigh_solution(solution: SessionSolution[VisitT], taken: tuple[Taken, ...]) -> Trial[VisitT]:
     """Return the trial of a solution: the log evidence of what was measured, as given, with the prices of causes."""
     session, inputs, optimum = solution.session, solution.inputs, solution.asked.screen.optimum
-    used = used_rows(session)
+    used = list_used_rows(session)
     if isinstance(session, Solved):
         places = 0
         if session.outcome.aligned and session.prepared.prior_map is not None:

@@ -135,7 +135,7 @@ def _ray(image: FloatArray, sensor: SpatialSensor) -> FloatArray:
             (a, b), (c, d) = (slope[..., 0, 0], slope[..., 0, 1]), (slope[..., 1, 0], slope[..., 1, 1])
             step = np.stack([d * miss[..., 0] - b * miss[..., 1], a * miss[..., 1] - c * miss[..., 0]], axis=-1)
             plane -= step / (a * d - b * c)[..., None]
-            if _settled(miss):
+            if _settle_pixels(miss):
                 break
         plane[np.linalg.norm(_brown(plane, sensor.distortion)[0] - image, axis=-1) > 1e-9] = np.nan
     return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
@@ -148,12 +148,12 @@ def _ray_of_fisheye(image: FloatArray, sensor: SpatialSensor) -> FloatArray:
         there, slope = _bent(angle, sensor.distortion)
         miss = there - distance
         angle = np.clip(angle - miss / slope, 0.0, np.pi)
-        if _settled(miss):
+        if _settle_pixels(miss):
             break
     angle = np.where(np.abs(_bent(angle, sensor.distortion)[0] - distance) > 1e-9, np.nan, angle)
     along = np.where(distance > 0.0, np.sin(angle) / np.where(distance > 0.0, distance, 1.0), 1.0)
     return np.concatenate([along[..., None] * image, np.cos(angle)[..., None]], axis=-1)
 
 
-def _settled(miss: Any) -> bool:
+def _settle_pixels(miss: Any) -> bool:
     return not np.nanmax(np.abs(miss), initial=0.0) > 1e-14

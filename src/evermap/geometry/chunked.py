@@ -104,7 +104,7 @@ class ChunkedCovariance:
     def of_points(cls, position_m: FloatArray, joint: Joint) -> Self:
         """Cut points (P, 2) into chunks, and keep what `joint` says of neighbouring ones."""
         dim = position_m.shape[1]
-        chunk = _halved(position_m)
+        chunk = _halve_chunks(position_m)
         centre = _centres(chunk, position_m, int(chunk.max(initial=-1)) + 1)
         parent = np.full(len(centre), -1, dtype=np.int64)
         for c in range(1, len(centre)):
@@ -174,7 +174,7 @@ class ChunkedCovariance:
         wanted = np.unique(self.chunk[rows])
         if not len(wanted):
             return np.zeros((0, 0))
-        points, joint = self._completed(self._connected(wanted))
+        points, joint = self._complete_points(self._connect_chunks(wanted))
         place = np.empty(len(self), dtype=np.int64)
         place[points] = np.arange(len(points))
         at = se2.xy_rows(place[rows], self.dim)
@@ -220,7 +220,7 @@ class ChunkedCovariance:
         learned alone.
         """
         kept = np.flatnonzero(new.was >= 0)
-        chunk, parent = _joined(new, self)
+        chunk, parent = _join_points(new, self)
         n_chunks = len(parent)
         of_old = np.full(len(chunk), -1, dtype=np.int64)
         of_old[kept] = new.was[kept]
@@ -309,7 +309,7 @@ class ChunkedCovariance:
         block = self._block(self._index.pair_of(min(a, b), max(a, b)))
         return block if a <= b else block.T
 
-    def _connected(self, chunks: IntArray) -> IntArray:
+    def _connect_chunks(self, chunks: IntArray) -> IntArray:
         """Chunks, and those between them without which they would not hang together."""
         graph = self._index.graph
         while True:
@@ -332,7 +332,7 @@ class ChunkedCovariance:
                 return chunks
             chunks = np.union1d(chunks, way)
 
-    def _completed(self, chunks: IntArray) -> tuple[IntArray, FloatArray]:
+    def _complete_points(self, chunks: IntArray) -> tuple[IntArray, FloatArray]:
         """Points of chunks, and their joint covariance."""
         index, near = self._index, self._near(chunks)
         order = self._elimination(near)
@@ -366,7 +366,7 @@ class ChunkedCovariance:
         if found is None:
             if len(self._followed) >= MOST_FOLLOWED:
                 self._followed.clear()
-            found = self._followed[key] = self._regressed(c, given)
+            found = self._followed[key] = self._regress(c, given)
         return found
 
     @functools.cached_property
@@ -374,7 +374,7 @@ class ChunkedCovariance:
         """What `_follows` has found: a robot asks for the same chunks for some time."""
         return {}
 
-    def _regressed(self, c: int, given: list[int]) -> tuple[list[int], FloatArray, FloatArray]:
+    def _regress(self, c: int, given: list[int]) -> tuple[list[int], FloatArray, FloatArray]:
         own = self._between(c, c)
         while given:
             among = np.block([[self._between(g, h) for h in given] for g in given])
@@ -537,7 +537,7 @@ def _transport(before: FloatArray, after: FloatArray) -> FloatArray:
     return np.asarray(inverse @ inner @ inverse)
 
 
-def _halved(position_m: FloatArray) -> IntArray:
+def _halve_chunks(position_m: FloatArray) -> IntArray:
     """(P,) chunks of at most `MOST_POINTS`, numbered so that near ones have near numbers."""
     chunk = np.zeros(len(position_m), dtype=np.int64)
     count, waiting = 0, [np.arange(len(position_m))]
@@ -585,7 +585,7 @@ def _pairs(centre: FloatArray, parent: IntArray) -> IntArray:
     return np.column_stack([code // max(n, 1), code % max(n, 1)])
 
 
-def _joined(new: Update, before: ChunkedCovariance) -> tuple[IntArray, IntArray]:
+def _join_points(new: Update, before: ChunkedCovariance) -> tuple[IntArray, IntArray]:
     """(N,) chunks of the points after an update, and (C,) parents: new points join the nearest chunk, and those that
     have too many then are halved.
     """

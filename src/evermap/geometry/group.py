@@ -29,7 +29,7 @@ class Group(Protocol):
     def identity(self, *shape: int) -> FloatArray:
         """Return poses (*shape, size) at the origin."""
 
-    def normalised(self, pose: ArrayLike) -> FloatArray:
+    def normalise_poses(self, pose: ArrayLike) -> FloatArray:
         """Return each pose (..., size) in the one form that all functions return."""
 
     def compose(self, a: ArrayLike, b: ArrayLike) -> FloatArray:

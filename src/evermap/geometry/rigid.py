@@ -20,7 +20,7 @@ def rigid(source: FloatArray, target: FloatArray, weight: FloatArray | None = No
     if source.shape[-1] == 3:
         turn = _rotation(np.swapaxes(share * a, -1, -2) @ b)
         turned = np.concatenate([np.zeros_like(middle), turn], axis=-1)
-        return se3.normalised(np.concatenate([to - se3.transform(turned, middle), turn], axis=-1))
+        return se3.normalise_poses(np.concatenate([to - se3.transform(turned, middle), turn], axis=-1))
     across = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
     theta = np.arctan2(across, (share * a * b).sum(axis=(-2, -1)))
     turned = np.stack([np.zeros_like(theta), np.zeros_like(theta), theta], axis=-1)

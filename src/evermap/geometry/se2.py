@@ -21,7 +21,7 @@ def identity(*shape: int) -> FloatArray:
     return np.zeros((*shape, 3))
 
 
-def normalised(pose: ArrayLike) -> FloatArray:
+def normalise_poses(pose: ArrayLike) -> FloatArray:
     """Return poses (..., 3) with angles in (-pi, pi]."""
     pose = np.array(pose, dtype=np.float64)
     pose[..., 2] = wrap(pose[..., 2])

@@ -3,7 +3,7 @@
 The functions and conventions are those of `se2`: poses are perturbed on the right, `pose * exp(xi)`, with the twist
 `xi = (forward, left, up, roll, pitch, yaw)`, that is the translation, then the rotation vector, in the pose's frame.
 Quaternions are Hamilton's with the scalar last, of unit length, and of the one sign for which the last of their numbers
-that is not zero is positive. They may be given with any sign; `normalised` accepts any length as well.
+that is not zero is positive. They may be given with any sign; `normalise_poses` accepts any length as well.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def from_angles(roll_pitch_yaw: ArrayLike) -> FloatArray:
     return pose
 
 
-def normalised(pose: ArrayLike) -> FloatArray:
+def normalise_poses(pose: ArrayLike) -> FloatArray:
     """Return poses (..., 7) with quaternions of unit length and of one sign."""
     from evermap.geometry import se3_kernels
 
@@ -189,7 +189,7 @@ def rigid_directions(point: ArrayLike) -> FloatArray:
 
 def warm_up() -> None:
     """Compile what motions need, or load it where that was done before: for steps that may not wait for it."""
-    pose = compose(inverse(identity(1)), normalised(exp(np.zeros((1, 6)))))
+    pose = compose(inverse(identity(1)), normalise_poses(exp(np.zeros((1, 6)))))
     log(between(pose, pose))
     transform(pose, np.zeros(point_dim))
     rotation_of(pose)

@@ -126,7 +126,7 @@ def coefficients(q: float) -> Triple:
 
 @kernel
 def _put(out: FloatArray, row: int, at: Triple, a: Quaternion) -> None:
-    """Write a pose as `se3.normalised`."""
+    """Write a pose as `se3.normalise_poses`."""
     first = a[3]
     for k in (2, 1, 0):  # whichever of qw, qz, qy, qx is the first that is not zero says the sign
         if first == 0.0:

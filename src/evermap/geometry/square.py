@@ -70,7 +70,7 @@ def _square_poses(corner_px: FloatArray, size_m: FloatArray, sensor: SpatialSens
         plane = np.where(ray[..., 2:] > 0.0, ray[..., :2] / ray[..., 2:], np.nan)
         start = _infinitesimal(plane, size_m)
     corner_m = CORNERS * size_m[:, None, None]
-    solved = [_refined(pose, corner_m, corner_px, sensor) for pose in start]
+    solved = [_refine_poses(pose, corner_m, corner_px, sensor) for pose in start]
     pose, error, information = (np.stack(each) for each in zip(*solved, strict=True))
     order = np.argsort(np.where(np.isnan(error), np.inf, error), axis=0, kind="stable")
     rows = np.arange(len(size_m))
@@ -97,7 +97,7 @@ def _infinitesimal(plane: FloatArray, size_m: FloatArray) -> FloatArray:
     slope = homography[:, :2, :2] - at[:, :, None] * row[:, None, :]
     turn = _to_axis(at)
     narrow = turn[:, :2, :2] - at[:, :, None] * turn[:, 2:, :2]
-    flat = _solved(np.where(np.isfinite(narrow), narrow, np.eye(2)), slope)
+    flat = _solve_systems(np.where(np.isfinite(narrow), narrow, np.eye(2)), slope)
     gram = np.swapaxes(flat, 1, 2) @ flat
     trace = gram[:, 0, 0] + gram[:, 1, 1]
     determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] * gram[:, 1, 0]
@@ -155,27 +155,27 @@ def _position(rotation: FloatArray, plane: FloatArray, size_m: FloatArray) -> Fl
     across = np.swapaxes(matrix, 1, 2)
     normal = across @ matrix
     normal = np.where(np.isfinite(normal).all(axis=(1, 2), keepdims=True), normal, np.eye(3))
-    return _solved(normal, across @ wanted)[..., 0]
+    return _solve_systems(normal, across @ wanted)[..., 0]
 
 
-def _refined(
+def _refine_poses(
     pose: FloatArray, corner_m: FloatArray, corner_px: FloatArray, sensor: SpatialSensor
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Poses (M, 7) at the nearest minimum of the reprojection error, these errors (M,) and information (M, 6, 6)."""
     pose = pose.copy()
-    residual, normal, gradient = _linearised(pose, corner_m, corner_px, sensor)
+    residual, normal, gradient = _linearise_errors(pose, corner_m, corner_px, sensor)
     damping = np.full(len(pose), 1e-6)
     rows = np.flatnonzero(np.isfinite(residual))
     for _ in range(_STEPS):
         diagonal = np.einsum("mii->mi", normal[rows])
         damped = normal[rows] + np.einsum("mi,ij->mij", damping[rows, None] * diagonal + 1e-12, np.eye(6))
-        step = -_solved(damped, gradient[rows][..., None])[..., 0]
+        step = -_solve_systems(damped, gradient[rows][..., None])[..., 0]
         going = -np.sum(gradient[rows] * step, axis=1) > 1e-10 * residual[rows] + 1e-18  # what the step would gain
         rows, step = rows[going], step[going]
         if not len(rows):
             break
         tried = se3.retract(pose[rows], step)
-        after = _linearised(tried, corner_m[rows], corner_px[rows], sensor)
+        after = _linearise_errors(tried, corner_m[rows], corner_px[rows], sensor)
         better = (after[0] < residual[rows]) & (tried[:, 2] > 0.0)
         gained = rows[better]
         pose[gained], residual[gained] = tried[better], after[0][better]
@@ -184,7 +184,7 @@ def _refined(
     return pose, np.sqrt(residual / 8.0), normal
 
 
-def _linearised(
+def _linearise_errors(
     pose: FloatArray, corner_m: FloatArray, corner_px: FloatArray, sensor: SpatialSensor
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum of squares (M,), its normal matrices (M, 6, 6) and gradients (M, 6) by the perturbation of the pose."""
@@ -216,7 +216,7 @@ def _quaternion(rotation: FloatArray) -> FloatArray:
     return np.asarray(column / np.linalg.norm(column, axis=1, keepdims=True))
 
 
-def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+def _solve_systems(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solutions (M, K, L) of systems (M, K, K), nan of those that have none: corners that are hardly a square."""
     try:
         return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)

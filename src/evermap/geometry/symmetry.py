@@ -38,7 +38,7 @@ class Symmetry:
     free: bool = False
 
     @classmethod
-    def generated(cls, generators: str | Iterable[str]) -> Symmetry:
+    def generate_group(cls, generators: str | Iterable[str]) -> Symmetry:
         """Return the group that texts generate.
 
         Raises:
@@ -60,7 +60,7 @@ class Symmetry:
         if len(axes) > 1:
             raise ValueError("two axes generate all rotations; that is 'any'")
         axis = axes.pop() if axes else -1
-        return cls(axis, _closed(turns, axis))
+        return cls(axis, _close_group(turns, axis))
 
     def twisted(self, pose: FloatArray, reference: FloatArray) -> FloatArray:
         """Return poses (..., 7), turned about the axis to be as near as possible to `reference` (..., 7)."""
@@ -124,10 +124,10 @@ class Symmetries:
         """Return the symmetries of objects (P,) by the names of their classes.
 
         Raises:
-            ValueError: as of `Symmetry.generated`.
+            ValueError: as of `Symmetry.generate_group`.
         """
         row = {name: 1 + k for k, name in enumerate(stated)}
-        kinds = (Symmetry(), *(Symmetry.generated(texts) for texts in stated.values()))
+        kinds = (Symmetry(), *(Symmetry.generate_group(texts) for texts in stated.values()))
         return cls(kinds, np.array([row.get(name, 0) for name in names], dtype=np.int64))
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Symmetries:
@@ -183,7 +183,7 @@ def _part(text: str, degrees: str, axis: int) -> FloatArray:
     return se3.exp(np.eye(6)[3 + axis] * 2.0 * np.pi / round(parts))[3:]
 
 
-def _closed(generators: list[FloatArray], axis: int) -> FloatArray:
+def _close_group(generators: list[FloatArray], axis: int) -> FloatArray:
     """(G, 4) all products; of those that differ by a turn about the axis one."""
     found, new = se3.identity(1), se3.identity(1)
     if axis >= 0:

@@ -12,7 +12,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se2
-from evermap.io.bad_rows import Flaw, allowed_bad, flaw_of, sound_rows
+from evermap.io.bad_rows import Flaw, count_allowed_bad, flaw_of, sound_rows
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import (
@@ -164,7 +164,7 @@ def _without_bad(recording: _Recorded, warnings: list[str]) -> _Recorded:
         far = np.linalg.norm(seen.position_sensor_m, axis=1)
         flaws = [flaw_of(replace(RANGE_M, high=np.inf), np.where(cornered, 1.0, far), path, seen.source_line)]
         flaws += _outside_image(seen, recording.sensors, path, warnings)
-    if any(flaw.bad.sum() > allowed_bad(len(seen)) for flaw in flaws):
+    if any(flaw.bad.sum() > count_allowed_bad(len(seen)) for flaw in flaws):
         return recording
     sound = sound_rows(flaws, len(seen), path, warnings)
     return recording if sound is None else replace(recording, detections=seen[sound])
@@ -182,7 +182,7 @@ def _outside_image(
         share = seen.corner_px[rows] / np.array(sensor.resolution_px, dtype=np.float64)
         outside[rows] = ((share < -OUTSIDE) | (share > 1.0 + OUTSIDE)).any(axis=(1, 2))
     count = int(outside.sum())
-    if count > allowed_bad(len(seen)):
+    if count > count_allowed_bad(len(seen)):
         known = ", ".join(
             f"{one.name} {one.resolution_px[0]} x {one.resolution_px[1]}" for one in sensors if one.resolution_px
         )

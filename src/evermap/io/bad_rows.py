@@ -29,7 +29,7 @@ class Flaw(NamedTuple):
     error: Callable[[int], InputError]
 
 
-def allowed_bad(rows: int) -> int:
+def count_allowed_bad(rows: int) -> int:
     """Return how many of some rows may be bad."""
     return int(MOST_BAD * rows)
 
@@ -67,7 +67,7 @@ def sound_rows(flaws: Sequence[Flaw], rows: int, path: Path, warnings: list[str]
 
 def refuse_many(bad: int, rows: int, first: InputError) -> None:
     """Raise the error of the first bad row where there are more than `MOST_BAD` of them."""
-    if bad <= allowed_bad(rows):
+    if bad <= count_allowed_bad(rows):
         return
     if bad == 1:
         raise first
@@ -94,7 +94,7 @@ def order_of_stray(stamp_s: FloatArray, *, path: Path, line: IntArray, warnings:
     if not len(back):
         return None
     stray = len(stamp_s) - longest_forward(stamp_s)
-    if stray > allowed_bad(len(stamp_s)):
+    if stray > count_allowed_bad(len(stamp_s)):
         return None
     where = f"time runs backwards at line {line[back[0] + 1]}"
     warnings.append(f"{path.name}: {count_text(stray, len(stamp_s))} out of order sorted ({where})")

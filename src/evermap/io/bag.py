@@ -29,7 +29,7 @@ from evermap.estimate.kind import Messages, TableRows
 from evermap.estimate.measurements import find_kinds
 from evermap.geometry import se3
 from evermap.io.assemble import finish_recording, looks_of
-from evermap.io.bag_messages import POSES, TRANSFORMS, TWISTS, BagContent, SeenColumns, scanned
+from evermap.io.bag_messages import POSES, TRANSFORMS, TWISTS, BagContent, SeenColumns, scan_bag
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rig_toml import Rig, cameras
 from evermap.io.rosbag import BAG_ENDINGS, METADATA
@@ -157,11 +157,11 @@ def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | No
     path = Path(path)
     if robot is not None:
         raise InputError(f"there is no robot {robot}: a bag has one robot", path=path, hint="omit the robot")
-    content, stated = scanned(_bag_at(path)), settings_path(path) if topics is None else Path(topics)
-    settings = guessed_settings(content)
+    content, stated = scan_bag(_bag_at(path)), settings_path(path) if topics is None else Path(topics)
+    settings = guess_settings(content)
     if topics is None and not stated.is_file():
         return _recording(path, content, settings, guessed=True)
-    return _recording(path, content, stated_settings(stated, content, settings), guessed=False)
+    return _recording(path, content, state_settings(stated, content, settings), guessed=False)
 
 
 def bag_settings(path: str | Path) -> str:
@@ -171,8 +171,8 @@ def bag_settings(path: str | Path) -> str:
         InputError: the bag is missing or damaged.
         MissingExtraError: `rosbags` is not installed.
     """
-    content = scanned(_bag_at(Path(path)))
-    settings = guessed_settings(content)
+    content = scan_bag(_bag_at(Path(path)))
+    settings = guess_settings(content)
     sections: dict[str, dict[str, Any]] = {"bag": {key: getattr(settings, key) for key in _TEXTS}}
     for name, one in settings.sensors.items():
         given: dict[str, Any] = {key: getattr(one, key) for key in _OF_SENSOR}
@@ -199,7 +199,7 @@ _HEAD = """\
 """
 
 
-def guessed_settings(content: BagContent) -> BagSettings:
+def guess_settings(content: BagContent) -> BagSettings:
     """Return what topics seem to be, by their types and names."""
 
     def rank(topic: str) -> tuple[bool, int, bool, int]:
@@ -263,7 +263,7 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
     return BagSensor(topic, frame, camera if pixels else "", rectified and pixels, identity)
 
 
-def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
+def state_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
     """Return the settings in a file; what is missing is as guessed.
 
     `whole`: topics that the content lacks are errors; else they may come yet.
@@ -295,11 +295,11 @@ def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, wh
         return settings
     rig = cameras(reader, Settings(), SpatialSensor(), tuple(_OF_SENSOR))
     as_guessed = {one.topic: one for one in guessed.sensors.values()}
-    sensors = {one.name: _parsed_sensor(reader, one, content if whole else None, as_guessed) for one in rig.sensors}
+    sensors = {one.name: _parse_sensor(reader, one, content if whole else None, as_guessed) for one in rig.sensors}
     return replace(settings, sensors=sensors, rig=rig)
 
 
-def _parsed_sensor(
+def _parse_sensor(
     reader: TomlReader, stated: SpatialSensor, content: BagContent | None, guessed: Mapping[str, BagSensor]
 ) -> BagSensor:
     section, given = f"camera.{stated.name}", reader.document["camera"][stated.name]
@@ -344,7 +344,7 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         for kind in (kind for kind, topic in settings.measurements.items() if not topic):
             some = ", ".join(topic for name, topic in content.measured if name == kind)
             warnings.append(f"{kind} of several sensors not read: {some} (`evermap init bag`, then [measurements])")
-    sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
+    sensors = tuple(mount_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
     stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
     messages = sum(len({one.look for one in content.seen[sensor.topic]}) for sensor in settings.sensors.values())
@@ -463,7 +463,7 @@ def _tell_late(content: BagContent, settings: BagSettings, warnings: list[str]) 
         )
 
 
-def mounted_sensor(
+def mount_sensor(
     path: Path, content: BagContent, settings: BagSettings, name: str, warnings: list[str]
 ) -> SpatialSensor:
     """Return a sensor with its mount and calibration, as stated, or as the bag has them.
@@ -591,7 +591,7 @@ def _odometry(
     if content.kind(topic) in TWISTS:
         return replace(integrated(stamp_s, rows, clock), z_up=z_up)
     variance = np.where(rows[:, 7:] > 0.0, rows[:, 7:], np.nan)
-    odometry = SpatialOdometry(stamp_s, se3.normalised(rows[:, :7]), variance, clock=clock, z_up=z_up)
+    odometry = SpatialOdometry(stamp_s, se3.normalise_poses(rows[:, :7]), variance, clock=clock, z_up=z_up)
     mount = content.mount(settings.base_frame, child) if child else None
     return of_rig(odometry, se3.identity() if mount is None else mount)
 

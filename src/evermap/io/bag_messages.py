@@ -143,7 +143,7 @@ class BagContent:
         return found.get(sensor)
 
 
-def scanned(path: Path) -> BagContent:
+def scan_bag(path: Path) -> BagContent:
     """Return what a bag holds.
 
     Raises:
@@ -154,7 +154,7 @@ def scanned(path: Path) -> BagContent:
 
     def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
         content.topics = dict(topics)
-        found = {topic: handler_of(content, topic) or _measured_of(content, topic) for topic in topics}
+        found = {topic: handler_of(content, topic) or _find_adder(content, topic) for topic in topics}
         return {topic: handler for topic, handler in found.items() if handler is not None}
 
     scan(path, handlers)
@@ -167,7 +167,7 @@ def handler_of(content: BagContent, topic: str) -> Handler | None:
     if kind in POSES + TWISTS:
         return _motion_of(content, topic)
     if kind in _DETECTIONS:
-        return _seen_of(content, topic, _DETECTIONS[kind])
+        return _find_columns_of(content, topic, _DETECTIONS[kind])
     if kind == "CameraInfo":
         return _camera_of(content, topic)
     if kind in FRAMES:
@@ -175,7 +175,7 @@ def handler_of(content: BagContent, topic: str) -> Handler | None:
     return None
 
 
-def _measured_of(content: BagContent, topic: str) -> Handler | None:
+def _find_adder(content: BagContent, topic: str) -> Handler | None:
     """Return what adds a message to the measurements that are made of its type; None of other types."""
     kind = "" if content.topics[topic].encoding else content.kind(topic)
     readers = [
@@ -223,7 +223,7 @@ def _motion_of(content: BagContent, topic: str) -> Handler:
     return handle
 
 
-def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterator[Seen]]) -> Handler:
+def _find_columns_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterator[Seen]]) -> Handler:
     rows = content.seen.setdefault(topic, [])
     content.stamps.setdefault(topic, [])
 
@@ -250,8 +250,8 @@ def _edges_of(content: BagContent, message: Any, received_s: float) -> None:
         if content.keeps_transforms:
             _take_transform(content, edge, pose, (stamp_of(one), received_s))
         if edge not in content.edges:
-            content.edges[edge] = se3.normalised(pose)
-        elif np.abs(se3.log(se3.compose(se3.inverse(content.edges[edge]), se3.normalised(pose)))).max() > 1e-6:
+            content.edges[edge] = se3.normalise_poses(pose)
+        elif np.abs(se3.log(se3.compose(se3.inverse(content.edges[edge]), se3.normalise_poses(pose)))).max() > 1e-6:
             content.moving.add(edge)
 
 

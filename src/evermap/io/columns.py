@@ -29,7 +29,7 @@ from evermap.io.arrow import (
     read_parquet,
 )
 from evermap.io.files import unpacked
-from evermap.io.table import FORMULA, NamedColumns, Table, guarded, parse_csv
+from evermap.io.table import FORMULA, NamedColumns, Table, guard, parse_csv
 from evermap.io.text import quote, reason
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray
 from evermap.valid import Quantity
@@ -63,7 +63,7 @@ class Columns(NamedColumns):
                 return self._table({quantity.name: cells.to_pylist()}).numbers(quantity)
             values = converted
         else:
-            values = self._converted(cells, quantity.name)
+            values = self._convert_cells(cells, quantity.name)
         quantity.check(values, path=self.path, line=self.line)
         return values
 
@@ -81,7 +81,7 @@ class Columns(NamedColumns):
         """
         cells = self.columns[name]
         if not _is_text(cells.type):
-            values = self._converted(cells, name)
+            values = self._convert_cells(cells, name)
             wrong = np.flatnonzero(~((values == 0.0) | (values == 1.0) | np.isnan(values)))
             if wrong.size:
                 raise self.error(f"{values[wrong[0]]:g} is neither 1 nor 0", row=int(wrong[0]), field=name, hint=hint)
@@ -106,7 +106,7 @@ class Columns(NamedColumns):
         """
         cells = self.columns[name]
         if pa.types.is_floating(cells.type):
-            values = self._converted(cells, name)
+            values = self._convert_cells(cells, name)
             wrong = np.flatnonzero(~np.isnan(values) & ~((values == np.floor(values)) & (np.abs(values) < 2.0**63)))
             if wrong.size:
                 problem = f"{values[wrong[0]]:g} is not a name"
@@ -127,7 +127,7 @@ class Columns(NamedColumns):
     def _table(self, columns: Mapping[str, Any]) -> Table:
         return Table(self.path, columns, self.line, self.header_line)
 
-    def _converted(self, cells: Any, name: str) -> FloatArray:
+    def _convert_cells(self, cells: Any, name: str) -> FloatArray:
         """Cells that are not text as float64."""
         kind = cells.type
         if pa.types.is_timestamp(kind):
@@ -149,7 +149,7 @@ def read_columns(source: TableSource, warnings: list[str]) -> Columns:
         return _of_arrow(arrow_table(source), path_of(source))
     path = path_of(source)
     if path.is_dir() and parquet_files(path):
-        return _joined(list(parquet_batches(path)))
+        return _join_files(list(parquet_batches(path)))
     data = _content(path)
     if data[:4] == b"PAR1":
         return _of_arrow(read_parquet(data, path), path)
@@ -195,7 +195,7 @@ def _of_arrow(table: Any, path: Path) -> Columns:
     return Columns(path, cells, np.arange(1, table.num_rows + 1))
 
 
-def _joined(parts: Sequence[Columns]) -> Columns:
+def _join_files(parts: Sequence[Columns]) -> Columns:
     if not parts:
         return Columns(Path(), {}, np.zeros(0, dtype=np.int64))
     cells = {name: pa.concat_arrays([part.columns[name] for part in parts]) for name in parts[0].columns}
@@ -277,7 +277,7 @@ def needs_quotes(cells: Any) -> bool:
 def _cells(column: Any) -> Any:
     """A column for a CSV file, nan as null, and without text that a spreadsheet would execute."""
     if not isinstance(column, np.ndarray):
-        return mapped(column, FORMULA, guarded) if _is_text(column.type) else column
+        return mapped(column, FORMULA, guard) if _is_text(column.type) else column
     return arrow_cells(column, ~np.isnan(column) if column.dtype.kind == "f" else None)
 
 

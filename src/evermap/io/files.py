@@ -285,7 +285,7 @@ def write_new(path: str | Path, content: bytes | str) -> Path:
 
 
 @contextmanager
-def staged_folder(folder: str | Path) -> Iterator[Path]:
+def stage_folder(folder: str | Path) -> Iterator[Path]:
     """Yield a temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
 
     Raises:

@@ -198,7 +198,7 @@ def _is_up(up: Any) -> bool:
     return abs(math.hypot(*axes) - 1.0) < 1e-6 and up["sigma_rad"] > 0.0
 
 
-def checked_about(about: Any, path: Path) -> dict[str, Any]:
+def check_about(about: Any, path: Path) -> dict[str, Any]:
     """Return `about_map` as read from a file.
 
     Raises:
@@ -229,7 +229,7 @@ def parquet_about(data: bytes, path: Path) -> dict[str, Any]:
         about = json.loads(metadata[b"evermap"])
     except (ValueError, RecursionError):
         about = None
-    return checked_about(about, path)
+    return check_about(about, path)
 
 
 def labels_of(class_id: IntArray, class_names: Sequence[str]) -> list[str]:
@@ -397,7 +397,7 @@ def parse_geojson(data: bytes, path: Path) -> tuple[Table, dict[str, Any]]:
         problem = "does not state that its coordinates are metres in a local frame"
         hint = 'a top-level member "evermap": {"frame": "prior_map"}'
         raise InputError(problem, path=path, field="evermap", hint=hint)
-    about = checked_about(document["evermap"], path)
+    about = check_about(document["evermap"], path)
     points = [(number, one) for number, one in enumerate(document["features"], 1) if _is_point(one)]
     rows = [_properties(feature, path, number) for number, feature in points]
     names = list(dict.fromkeys(name for row in rows for name in row)) or ["landmark_id", "x_m", "y_m"]

@@ -145,7 +145,7 @@ def pose_of(values: Mapping[str, float], units: Units, within: FloatArray) -> Fl
     pose = se3.identity()
     if stated == QUATERNION:
         pose[3:] = turn
-        pose = se3.normalised(pose)
+        pose = se3.normalise_poses(pose)
     elif stated == ANGLES:
         pose = se3.from_angles(turn * units.radian)
     elif stated == VECTOR:

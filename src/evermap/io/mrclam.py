@@ -152,7 +152,7 @@ def _read_measurements(
     rows = _parse(files, name, (q.STAMP_S, _BARCODE, q.RANGE_M, q.BEARING_RAD), warnings)
     if len(rows) == 0:
         raise DataError("contains no measurement", path=rows.path)
-    rows = _sorted(rows, warnings)
+    rows = _sort_rows(rows, warnings)
     subject = _subjects(files, _whole(rows, 1, "barcode"), name, warnings)
     stamps, frame = np.unique(rows.column(0), return_inverse=True)
     landmark = np.flatnonzero(subject > LAST_ROBOT_SUBJECT)
@@ -229,11 +229,11 @@ def _parse(files: FileSet, name: str, quantities: tuple[q.Quantity, ...], warnin
 
 
 def _forward_in_time(rows: Rows, warnings: list[str]) -> Rows:
-    rows = _sorted(rows, warnings)
+    rows = _sort_rows(rows, warnings)
     return rows[last_of_equal(rows.column(0), path=rows.path, warnings=warnings)]
 
 
-def _sorted(rows: Rows, warnings: list[str]) -> Rows:
+def _sort_rows(rows: Rows, warnings: list[str]) -> Rows:
     """The rows by time, where only a few are out of order: the first odometry row of data set 9 is, as published.
 
     Raises:

@@ -107,7 +107,7 @@ def _recording_of(files: FileSet, source: str) -> Recording | SpatialRecording:
     warnings: list[str] = []
     _warn_of_similar_names(files, warnings)
     tables = {name: _read_table(files, name, warnings) for name in (*TABLES, *measurement_names())}
-    seen = _needed("detections", tables, files)
+    seen = _find_needed("detections", tables, files)
     if in_space(tables, files):
         rig = read_rig(files, warnings)
         rig = replace(rig, settings=_on_clock(rig.settings, tables, files))
@@ -117,7 +117,7 @@ def _recording_of(files: FileSet, source: str) -> Recording | SpatialRecording:
         found = spatial_recording(tables, rig, planar, title=files.title, source=source, warnings=warnings)
         return replace(found, objects=_objects(tables["objects"], dict(found.landmark_names)))
     settings = _on_clock(_read_settings(files, warnings), tables, files)
-    clock, driven = settings.clock, _needed("odometry", tables, files)
+    clock, driven = settings.clock, _find_needed("odometry", tables, files)
     names: dict[int, str] = {}
     class_names = settings.class_names
     if class_names is None:
@@ -144,7 +144,7 @@ def _recording_of(files: FileSet, source: str) -> Recording | SpatialRecording:
     return finish_recording(recording, warnings=warnings)
 
 
-def _needed(name: str, tables: Mapping[str, Table | None], files: FileSet) -> Table:
+def _find_needed(name: str, tables: Mapping[str, Table | None], files: FileSet) -> Table:
     """Return a table that a recording cannot do without."""
     table = tables[name]
     if table is None:

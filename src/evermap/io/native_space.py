@@ -26,7 +26,7 @@ from evermap.io.spatial import (
     covariances,
     directions,
     integrated,
-    posed_odometry,
+    pose_odometry,
     poses,
     positions,
     quaternions,
@@ -109,7 +109,7 @@ def spatial_recording(
     class_names = settings.class_names
     if class_names is None:
         class_names = distinct_labels(table, landmarks)
-    table = _screened(_by_sensor(table), warnings)
+    table = _screen_rows(_by_sensor(table), warnings)
     frames, frame = _frames(table, tables["frames"], rig, warnings)
     detections = _detections(table, frame, rig, class_names, names, warnings)
     if landmarks is not None and len(landmarks):
@@ -158,7 +158,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
     if len(table) == 0:
         raise DataError("contains no odometry", path=table.path)
     if given is not TWIST:
-        return posed_odometry(table, VARIANCES, clock, warnings)
+        return pose_odometry(table, VARIANCES, clock, warnings)
     table = table.screened((q.STAMP_S, *q.TWIST), warnings)
     stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
@@ -190,7 +190,7 @@ def truth_of(
     return true_poses(table, clock, warnings, poses)
 
 
-def _screened(table: Table, warnings: list[str]) -> Table:
+def _screen_rows(table: Table, warnings: list[str]) -> Table:
     """The detections without bad rows, and without orientations of four zeros."""
     cornered = table.has_any(CORNERS)
     axes = [replace(axis, optional=cornered) for axis in (q.X_M, q.Y_M, q.Z_M)]
@@ -246,7 +246,7 @@ def _detections(
         columns |= _placed(table)
     detections = spatial_detections(frame, **columns, **features_of(table))
     if table.has_any(CORNERS):
-        detections = _cornered(table, detections, rig)
+        detections = _add_corners(table, detections, rig)
     detections = with_tag_poses(detections, rig.sensors, warnings)
     behind = np.asarray(np.isnan(detections.position_sensor_m).any(axis=1))
     if behind.any():
@@ -311,7 +311,7 @@ def _placed(table: Table) -> dict[str, FloatArray]:
     return found
 
 
-def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialDetections:
+def _add_corners(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialDetections:
     """The detections with the corners of tags, and the tags' sizes."""
     table.expect(CORNERS, tuple(table.columns))
     corner = np.stack([table.numbers(_pixel(name, optional=True)) for name in CORNERS], axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.io.arrow import parquet_bytes
-from evermap.io.files import staged_folder, write_atomic
+from evermap.io.files import stage_folder, write_atomic
 from evermap.io.landmarks import labels_of, survey_columns
 from evermap.io.measurements import measurement_columns, measurement_names
 from evermap.io.native_space import CORNERS, VARIANCES
@@ -60,7 +60,7 @@ def write_native(
     if format not in ("csv", "parquet"):
         raise ConfigError(f"unknown native format '{format}'", field="format", hint="csv or parquet")
     texts, tables = _contents(recording)
-    with staged_folder(folder) as staging:
+    with stage_folder(folder) as staging:
         for name, text in texts.items():
             (staging / name).write_text(text, encoding="utf-8")
         for name, columns in tables.items():
@@ -82,7 +82,7 @@ def write_session(recording: Recording | SpatialRecording, file: str | Path) -> 
     """
     fewer: dict[str, Any] = {"truth": None, "true_landmarks": None}
     if recording.odometry is not None:
-        fewer["odometry"] = _composed(recording.odometry, recording.frames.stamp_s)
+        fewer["odometry"] = _compose_odometry(recording.odometry, recording.frames.stamp_s)
     texts, tables = _contents(replace(recording, **fewer))
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -95,7 +95,7 @@ def write_session(recording: Recording | SpatialRecording, file: str | Path) -> 
     return write_atomic(file, buffer.getvalue())
 
 
-def _composed(odometry: Any, frame_s: FloatArray) -> Any:
+def _compose_odometry(odometry: Any, frame_s: FloatArray) -> Any:
     """Odometry with rows at the last of its stamps before each frame and the first after it, and at times between."""
     stamp_s = odometry.stamp_s
     if len(stamp_s) < 2:
@@ -167,22 +167,22 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
         tables["detections"] |= _given(_columns(detections, "sigma_range_m", "sigma_bearing_rad"))
     tables["frames"] = {"stamp_s": recording.frames.stamp_s}
     if recording.truth is not None:
-        tables["truth"] = _posed(recording.truth)
+        tables["truth"] = _write_poses(recording.truth)
     if recording.true_landmarks is not None:
         tables["landmarks"] = _survey(recording.true_landmarks, called, names)
     if recording.robot_sightings is not None:
         tables["robot_sightings"] = _columns(recording.robot_sightings, "stamp_s", "robot_id", "range_m", "bearing_rad")
     if len(recording.objects):
-        landmark_id = _called(recording.objects[:, 0], called)
+        landmark_id = _write_names(recording.objects[:, 0], called)
         tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}
     for table in recording.measurements:
         columns = measurement_columns(table)
-        place = {"landmark_id": _called(table.landmark_id, called)} if "landmark_id" in columns else {}
+        place = {"landmark_id": _write_names(table.landmark_id, called)} if "landmark_id" in columns else {}
         tables[table.kind] = _given({**columns, **place})
     return tables
 
 
-def _posed(path: Trajectory | SpatialOdometry) -> dict[str, FloatArray]:
+def _write_poses(path: Trajectory | SpatialOdometry) -> dict[str, FloatArray]:
     pose = path.pose_world_robot
     names = (*AT, *QUATERNION) if pose.shape[1] == 7 else ("x_m", "y_m", "theta_rad")
     return {"stamp_s": path.stamp_s, **dict(zip(names, pose.T, strict=True))}
@@ -195,12 +195,12 @@ def _columns(table: Any, *names: str) -> dict[str, FloatArray]:
 def _odometry(odometry: Odometry | SpatialOdometry) -> dict[str, FloatArray]:
     if isinstance(odometry, Odometry):
         return _columns(odometry, "stamp_s", "forward_mps", "lateral_mps", "angular_radps")
-    return {**_posed(odometry), **_given(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
+    return {**_write_poses(odometry), **_given(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
 
 
 def _in_plane(recording: Recording) -> dict[str, Any]:
     detections = recording.detections
-    landmark_id = _called(detections.landmark_id, recording.landmark_names)
+    landmark_id = _write_names(detections.landmark_id, recording.landmark_names)
     return {"landmark_id": landmark_id, **_columns(detections, "range_m", "bearing_rad")}
 
 
@@ -218,7 +218,7 @@ def _in_space(recording: SpatialRecording) -> dict[str, Any]:
     }
     return {
         "sensor": [sensors[row] for row in detections.sensor.tolist()],
-        "landmark_id": _called(detections.landmark_id, recording.landmark_names),
+        "landmark_id": _write_names(detections.landmark_id, recording.landmark_names),
         **dict(zip(AT, detections.position_sensor_m.T, strict=True)),
         **_given(details),
     }
@@ -231,13 +231,13 @@ def _given(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
 
 def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[str, ...]) -> dict[str, Any]:
     columns = survey_columns(landmarks)
-    columns["landmark_id"] = _called(landmarks.landmark_id, {**names, **landmarks.names})
+    columns["landmark_id"] = _write_names(landmarks.landmark_id, {**names, **landmarks.names})
     if np.any(landmarks.class_id != UNKNOWN):
         columns["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or class_names)
     return columns
 
 
-def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
+def _write_names(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     """Return a column of ids: as numbers, or as text if any id is one; other names would be read as other ids."""
     if not any(is_text_of(names[one], one) for one in {*landmark_id.tolist()} & names.keys()):
         return landmark_id

@@ -297,7 +297,7 @@ def _pose(values: FloatArray, graph: _Graph, line: int) -> FloatArray:
         return pose
     if not np.linalg.norm(values[3:]) > 0.1:
         raise InputError("is not a quaternion", path=graph.path, line=line, hint="x y z qx qy qz qw")
-    return np.asarray(se3.normalised(values))
+    return np.asarray(se3.normalise_poses(values))
 
 
 def _sigmas(name: str, noise: FloatArray, form: _Form, *, of_covariance: bool) -> FloatArray:

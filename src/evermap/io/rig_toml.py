@@ -198,7 +198,7 @@ def _mount(reader: TomlReader, section: str, content: dict[str, Any]) -> tuple[f
         quaternion = np.array([reader.number(section, key, content[key], -2.0, 2.0) for key in QUATERNION])
         if abs(np.linalg.norm(quaternion) - 1.0) > 1e-2:
             raise reader.error(section, "qw", "qx, qy, qz, qw are not a unit quaternion", hint="scalar last")
-        return tuple(se3.normalised(np.concatenate([at, quaternion])).tolist())
+        return tuple(se3.normalise_poses(np.concatenate([at, quaternion])).tolist())
     turns = [reader.number(section, key, content.get(key, 0.0), -2 * pi, 2 * pi) for key in _ANGLES]
     return (*at, *se3.from_angles(turns)[3:].tolist())
 
@@ -226,7 +226,7 @@ def _symmetries(reader: TomlReader, class_names: tuple[str, ...] | None) -> dict
         if not texts or not all(isinstance(text, str) for text in texts):
             raise reader.error("symmetries", name, "must be a text, or a list of texts", hint=HINT)
         try:
-            Symmetry.generated(texts)
+            Symmetry.generate_group(texts)
         except ValueError as error:
             raise reader.error("symmetries", name, str(error), hint=HINT) from None
         found[name] = texts

@@ -142,7 +142,7 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
     except ImportError:
         raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
     try:
-        with tempfile.TemporaryDirectory() as folder, _opened(_unpacked(path, Path(folder))) as bag:
+        with tempfile.TemporaryDirectory() as folder, _open_bag(_unpacked(path, Path(folder))) as bag:
             foreign: dict[str, Topic] = getattr(bag, "foreign", {})
             if foreign and not bag.connections:
                 encodings = ", ".join(sorted({one.encoding for one in foreign.values()}))
@@ -186,7 +186,7 @@ def ros2_types() -> Any:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_bag(path: Path) -> Iterator[Any]:
     """The reader of a bag; that of `rosbags` fails at MCAP files with other messages than those of ROS 2."""
     from rosbags.highlevel import AnyReader, AnyReaderError
 

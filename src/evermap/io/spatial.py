@@ -94,7 +94,7 @@ def unit(quaternion: FloatArray) -> FloatArray:
     pose = np.concatenate([np.zeros((*quaternion.shape[:-1], 3)), quaternion], axis=-1)
     there = np.abs(np.linalg.norm(quaternion, axis=-1, keepdims=True) - 1.0) < 1e-12
     with np.errstate(invalid="ignore"):
-        normal = se3.normalised(pose)[..., 3:]
+        normal = se3.normalise_poses(pose)[..., 3:]
     same = np.where(np.sum(normal * quaternion, axis=-1, keepdims=True) < 0.0, -quaternion, quaternion)
     return np.where(there, same, normal)
 
@@ -104,7 +104,7 @@ def poses(table: Table) -> FloatArray:
     return np.concatenate([positions(table), quaternions(table)], axis=1)
 
 
-def posed_odometry(table: Table, variances: tuple[str, ...], clock: Clock, warnings: list[str]) -> SpatialOdometry:
+def pose_odometry(table: Table, variances: tuple[str, ...], clock: Clock, warnings: list[str]) -> SpatialOdometry:
     """Return the odometry in a table of poses, with the columns of their six variances as far as it has them."""
     table = table.screened((STAMP_S, X_M, Y_M, Z_M, *QUANTITIES), warnings)
     table = table.screened((), warnings, turn_flaws(table))

@@ -197,7 +197,7 @@ class Table(NamedColumns):
         if optional and name not in self:
             return np.full(len(self), UNKNOWN, dtype=np.int64)
         if names is not None and not isinstance(self.columns[name], np.ndarray):
-            return self._named_ids(name, optional, names)
+            return self._name_ids(name, optional, names)
         values = self.numbers(Quantity(name, UNKNOWN, _LARGEST_ID, optional=True, hint="whole numbers from 0"))
         absent = np.isnan(values) | (values == UNKNOWN)
         whole = np.where(absent, float(UNKNOWN), values)
@@ -212,7 +212,7 @@ class Table(NamedColumns):
         """Return whole numbers from 0; zeros where there is no such column. Shape (R,)."""
         return self.ids(name, optional=False) if name in self else np.zeros(len(self), dtype=np.int64)
 
-    def _named_ids(self, name: str, optional: bool, names: dict[int, str]) -> IntArray:
+    def _name_ids(self, name: str, optional: bool, names: dict[int, str]) -> IntArray:
         """Ids of a column in which some may be texts."""
         row_label, labels = self.labels(name)
         nameless = {label for label in labels if optional and label.lower() in _NO_NAME}
@@ -353,7 +353,7 @@ def parse_by_line(data: bytes, path: Path, warnings: list[str], *, few: bool = F
         numbers.pop()
     columns: Iterable[Sequence[str]] = zip(*rows, strict=True) if rows else [()] * len(names)
     if b"'" in data:
-        columns = [[unguarded(cell) for cell in column] for column in columns]
+        columns = [[unguard(cell) for cell in column] for column in columns]
     return Table(path, dict(zip(names, columns, strict=True)), np.array(numbers, dtype=np.int64), content[0][0])
 
 
@@ -389,7 +389,7 @@ def _parse_plain(data: bytes, path: Path) -> Table | None:
     if len(names) == 1 and not numbers_of(pc.binary_length(pc.utf8_trim_whitespace(last)), np.int32)[0].all():
         return None  # empty lines
     if b"'" in data:
-        cells = {name: mapped(column, GUARDED, unguarded) for name, column in cells.items()}
+        cells = {name: mapped(column, GUARDED, unguard) for name, column in cells.items()}
     return Table(path, cells, header.header_line + 1 + np.arange(rows), header.header_line)
 
 
@@ -430,23 +430,23 @@ def csv_text(columns: dict[str, Any], comment: str = "") -> str:
 
 def _csv_cells(column: Any) -> list[str]:
     if isinstance(column, list):
-        return [_quoted(guarded(cell)) for cell in column]
+        return [_quote(guard(cell)) for cell in column]
     if column.dtype.kind == "i":
         return ["" if value == UNKNOWN else str(value) for value in column.tolist()]
     return ["" if isnan(value) else repr(value) for value in column.tolist()]
 
 
-def guarded(cell: str) -> str:
+def guard(cell: str) -> str:
     """Return a text as a cell of a CSV file: a quote precedes what a spreadsheet would read as a formula."""
     return f"'{cell}" if re.match(FORMULA, cell) and not _is_number(cell) else cell
 
 
-def unguarded(cell: str) -> str:
-    """Return the text of a cell that `guarded` made."""
+def unguard(cell: str) -> str:
+    """Return the text of a cell that `guard` made."""
     return cell[1:] if re.match(GUARDED, cell) else cell
 
 
-def _quoted(cell: str) -> str:
+def _quote(cell: str) -> str:
     return '"' + cell.replace('"', '""') + '"' if any(c in cell for c in ',"#') else cell
 
 

@@ -22,7 +22,7 @@ from evermap.io.landmarks import survey_of
 from evermap.io.native_space import CORNERS
 from evermap.io.rig_toml import Rig
 from evermap.io.rosbag import BAG_ENDINGS, METADATA, MOST_HAMMING, TagSightings, read_tag_bag, topics_of
-from evermap.io.spatial import of_rig, posed_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
+from evermap.io.spatial import of_rig, pose_odometry, sensor_rows, spatial_detections, true_poses, with_tag_poses
 from evermap.io.table import ENDINGS, Table, parse_table
 from evermap.io.tag_maps import map_of_survey, pose_of_tagslam
 from evermap.io.text import counted, is_number
@@ -309,7 +309,7 @@ def _odometry(files: FileSet, warnings: list[str]) -> SpatialOdometry | None:
         return None
     if len(table) == 0:
         raise DataError("contains no odometry", path=table.path)
-    return posed_odometry(table, _VARIANCES, Clock.UNIX, warnings)
+    return pose_odometry(table, _VARIANCES, Clock.UNIX, warnings)
 
 
 def _reference(files: FileSet, warnings: list[str]) -> Trajectory | None:

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.geometry import se2, se3
 from evermap.geometry.camera import project
 from evermap.geometry.square import CORNERS
-from evermap.io.files import staged_folder
+from evermap.io.files import stage_folder
 from evermap.io.spatial import AT, QUATERNION
 from evermap.io.table import csv_text
 from evermap.types import FloatArray, SpatialSensor
@@ -110,7 +110,7 @@ def write_template(folder: str | Path, *, in_space: bool = False) -> Path:
     """
     texts = dict(_SPATIAL_FILES) if in_space else {"sensor.toml": _SENSOR_TOML}
     tables, comments = (_spatial_tables(), _SPATIAL_COMMENTS) if in_space else (_tables(), _COMMENTS)
-    with staged_folder(folder) as staging:
+    with stage_folder(folder) as staging:
         texts |= {f"{name}.csv": csv_text(columns, comment=comments[name]) for name, columns in tables.items()}
         for name, text in texts.items():
             (staging / name).write_text(text, encoding="utf-8", newline="\n")
@@ -280,11 +280,14 @@ def _spatial_tables() -> dict[str, dict[str, Any]]:
     start = se3.inverse(_walk_at(np.zeros(1)))
     tags = se3.compose(start, _tag_poses())
     return {
-        "odometry": {"stamp_s": odometry_s, **_posed(_drifting(se3.compose(start, _walk_at(odometry_s)), random))},
+        "odometry": {
+            "stamp_s": odometry_s,
+            **_pose_columns(_drifting(se3.compose(start, _walk_at(odometry_s)), random)),
+        },
         "detections": _corners(frame_s, random),
         "frames": {"stamp_s": frame_s},
-        "truth": {"stamp_s": truth_s, **_posed(se3.compose(start, _walk_at(truth_s)))},
-        "landmarks": {"landmark_id": np.arange(_TAGS), **_posed(tags), "tag_size_m": np.full(_TAGS, _TAG_M)},
+        "truth": {"stamp_s": truth_s, **_pose_columns(se3.compose(start, _walk_at(truth_s)))},
+        "landmarks": {"landmark_id": np.arange(_TAGS), **_pose_columns(tags), "tag_size_m": np.full(_TAGS, _TAG_M)},
     }
 
 
@@ -335,5 +338,5 @@ def _corners(frame_s: FloatArray, random: np.random.Generator) -> dict[str, Any]
     return {"stamp_s": frame_s[frame], "landmark_id": tag, **columns}
 
 
-def _posed(pose: FloatArray) -> dict[str, FloatArray]:
+def _pose_columns(pose: FloatArray) -> dict[str, FloatArray]:
     return dict(zip((*AT, *QUATERNION), (pose.round(6) + 0.0).T, strict=True))  # without -0.0

@@ -136,12 +136,12 @@ class Engine:
         """Sensors and classes in space, without readings; None in the plane."""
         self._sensor: Sensor | tuple[SpatialSensor, ...]
         if is_in_space(recording):
-            self._sensor = self._config.sensor.applied_in_space(recording.sensors)
+            self._sensor = self._config.sensor.apply_in_space(recording.sensors)
             self._rig = replace(recording, sensors=self._sensor, symmetries=symmetries or {})
             check_rig(self._sensor)
             self._inbox: Inbox = SpatialInbox(self._rig, self._config)
         else:
-            self._sensor = self._config.sensor.applied_to(recording.sensor)
+            self._sensor = self._config.sensor.apply_to(recording.sensor)
             check_sensor(self._sensor)
             self._inbox = Inbox(recording, self._config)
         self._group = PLANE if self._rig is None else SPACE
@@ -470,7 +470,7 @@ class Engine:
         assert self._rig is not None
         settings, sensors = self._config.slam.space, self._rig.sensors
         mount = np.array([one.mount_robot_sensor for one in sensors])
-        symmetries = (Symmetry(), *(Symmetry.generated(texts) for texts in self._rig.symmetries.values()))
+        symmetries = (Symmetry(), *(Symmetry.generate_group(texts) for texts in self._rig.symmetries.values()))
         return mount, state_sigmas(sensors, settings, driven=True), start_noise(settings, driven=True), symmetries
 
     def _localizer(self, places: Any, *, learn: bool) -> Localizer | SpatialLocalizer:
@@ -486,7 +486,7 @@ class Engine:
         return Localizer(places, self._sensor, prior, noise, settings=settings.localize, looks=looks, learn=learn)
 
     def _places(self, living: LivingMap, stamp_s: float) -> KnownPlaces:
-        rows = living.sighted_rows(aged(living, self._config.living, stamp_s).p_here)
+        rows = living.list_sighted(aged(living, self._config.living, stamp_s).p_here)
         if self._rig is not None:
             return SpatialPlaces.in_space(rows, living.covariance_m2, self._config.slam.space)
         return KnownPlaces.of(rows.landmark_id, rows.position_m, living.covariance_m2, rows.p_exists).existing()

@@ -87,7 +87,7 @@ def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading |
         yield None
 
 
-def replayed_in_space(recording: SpatialRecording, *, paced: bool = False) -> Iterator[Reading | None]:
+def replay_in_space(recording: SpatialRecording, *, paced: bool = False) -> Iterator[Reading | None]:
     """Yield the readings of a recording in space, as `replayed`."""
     odometry, seen = recording.odometry, recording.detections
     count = 0 if odometry is None else len(odometry)

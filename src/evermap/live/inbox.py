@@ -106,7 +106,7 @@ class Inbox:
         """
         quantities = STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS
         for quantity, value in zip(quantities, (stamp_s, *velocity), strict=True):
-            checked_number(quantity, value)
+            check_number(quantity, value)
         forward_mps, lateral_mps, angular_radps = (float(part) for part in velocity)
         row = float(stamp_s), forward_mps, lateral_mps, angular_radps
         with self._lock:
@@ -119,7 +119,7 @@ class Inbox:
         Raises:
             InputError: values that cannot be, or the stamp is before frames that were processed.
         """
-        checked_number(STAMP_S, stamp_s)
+        check_number(STAMP_S, stamp_s)
         frame = LiveFrame(float(stamp_s), self._rows(*columns))
         with self._lock:
             self._refuse_late(frame.stamp_s, "detections")
@@ -381,7 +381,7 @@ def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str
     )  # fmt: skip
 
 
-def checked_number(quantity: Any, value: Any) -> None:
+def check_number(quantity: Any, value: Any) -> None:
     """Raise InputError for what is no number, or none that can be."""
     try:
         told = np.array([value], dtype=np.float64)

@@ -16,7 +16,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Sighting
 from evermap.maps.sessions.session import judge_so_far, lives_of
 from evermap.maps.vicinity import Vicinity, near
-from evermap.slam.batch import sighted_at
+from evermap.slam.batch import sight_at
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import Located
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange, Sensor, rows_of
@@ -78,7 +78,7 @@ class Judge:
         known = located.place != UNKNOWN
         seen, off = (located.place[known & some] for some in (located.p_inlier > 0.5, located.p_inlier <= 0.5))
         reading = frame.rows[known & (located.p_inlier <= 0.5), 1:3]
-        away_m = sighted_at(located.pose, reading, states, self._mount) - self._position_m[off]
+        away_m = sight_at(located.pose, reading, states, self._mount) - self._position_m[off]
         glance = _Glance(frame.stamp_s, located.pose, self._names[seen], self._sites[seen], self._names[off], away_m)
         with self._lock:
             self._glances.append(glance)
@@ -95,7 +95,7 @@ class Judge:
         if len(whole.places) > config.whole_places:
             vicinity = _around(whole, glances, self._sensor, config)
             living = vicinity.part
-        after, told = judge_so_far(living, _sighted(living, glances), self._sensor, config, self._classes)
+        after, told = judge_so_far(living, _list_sights(living, glances), self._sensor, config, self._classes)
         changes, judged = _with_moves(told, glances, self._config.slam.fewest_sightings), after.landmarks()
         with self._lock:
             self._after = after, vicinity
@@ -128,7 +128,7 @@ class Judge:
         return shown
 
 
-def _sighted(living: LivingMap, glances: Sequence[_Glance]) -> Sighting:
+def _list_sights(living: LivingMap, glances: Sequence[_Glance]) -> Sighting:
     """Looks by rows of the map's places."""
     frame = np.repeat(np.arange(len(glances)), [len(one.landmark_id) for one in glances])
     place = living.place_row(

@@ -19,7 +19,7 @@ import numpy as np
 
 from evermap.errors import EvermapError, InputError
 from evermap.geometry import se2, se3
-from evermap.io.bag import BagSettings, detections_of, guessed_settings, mounted_sensor, stamps_of, stated_settings
+from evermap.io.bag import BagSettings, detections_of, guess_settings, mount_sensor, stamps_of, state_settings
 from evermap.io.bag_messages import OBJECT_FIELDS, POSES, BagContent, SeenColumns, handler_of, objects_in_space
 from evermap.io.cdr import parts_of
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
@@ -89,8 +89,8 @@ class Listener:
         self.settings: BagSettings | None = None
         """Chosen topics, once they are known."""
         if stated is not None:
-            guessed = guessed_settings(self._content)
-            self.settings = stated_settings(stated, self._content, guessed, whole=False)
+            guessed = guess_settings(self._content)
+            self.settings = state_settings(stated, self._content, guessed, whole=False)
             self._tell_settings("as stated")
 
     @property
@@ -157,7 +157,7 @@ class Listener:
 
     def _guess(self, now_s: float) -> bool:
         """Return whether the topics are chosen."""
-        guessed = guessed_settings(self._content)
+        guessed = guess_settings(self._content)
         if guessed.odometry and guessed.sensors:
             self._first_s = min(self._first_s, now_s)
             if now_s >= self._first_s + GUESS_S:
@@ -203,7 +203,7 @@ class Listener:
             pose = np.array(row[:7])
             if not np.linalg.norm(pose[3:]) > 0.5:
                 continue
-            here = _on_the_floor(pose if mount is None else se3.compose(se3.normalised(pose), se3.inverse(mount)))
+            here = _on_the_floor(pose if mount is None else se3.compose(se3.normalise_poses(pose), se3.inverse(mount)))
             before, self._driven = self._driven, (source, stamp_s, here)
             self._odometry.append((stamp_s, here))
             if before is not None and before[0] == source and stamp_s > before[1]:
@@ -219,7 +219,7 @@ class Listener:
         if not how.frame and topic in content.frames:
             how = replace(how, frame=content.frames[topic])
         settings = replace(self.settings, sensors={name: how})
-        sensor = mounted_sensor(_NO_PATH, content, settings, name, remarks)
+        sensor = mount_sensor(_NO_PATH, content, settings, name, remarks)
         placed = how.stated_mount or not remarks  # else where `sensor.toml` says
         names: dict[int, str] = {}
         labels = sorted(set(seen.label) - {""})

@@ -11,7 +11,7 @@ import numpy as np
 from evermap.config import Config
 from evermap.errors import InputError
 from evermap.geometry import se3
-from evermap.live.inbox import Inbox, LiveFrame, checked_number
+from evermap.live.inbox import Inbox, LiveFrame, check_number
 from evermap.types import (
     UNKNOWN,
     FloatArray,
@@ -45,11 +45,11 @@ class SpatialInbox(Inbox):
         Raises:
             InputError: no pose, or the stamp is before frames that were processed.
         """
-        checked_number(STAMP_S, stamp_s)
+        check_number(STAMP_S, stamp_s)
         given = np.asarray(pose, dtype=np.float64)
         if given.shape != (7,) or not np.isfinite(given).all() or abs(np.linalg.norm(given[3:]) - 1.0) > 1e-3:
             raise InputError(f"{pose} is not a pose", field="pose", hint="x, y, z, qx, qy, qz, qw")
-        row = float(stamp_s), *se3.normalised(given).tolist()
+        row = float(stamp_s), *se3.normalise_poses(given).tolist()
         with self._lock:
             self._refuse_late(row[0], "odometry")
             self._in_time(row[0], partial(self._put_odometry, row, -np.inf))
@@ -60,7 +60,7 @@ class SpatialInbox(Inbox):
         Raises:
             InputError: no finite numbers, or not in the order of their stamps.
         """
-        checked_number(STAMP_S, stamp_s)
+        check_number(STAMP_S, stamp_s)
         given = np.asarray(twist, dtype=np.float64)
         if given.shape != (6,) or not np.isfinite(given).all():
             raise InputError(f"{twist} is not a twist", field="twist", hint="metres and radians a second, x, y, z each")

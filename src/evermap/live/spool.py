@@ -61,7 +61,7 @@ class Spool:
             self._lock = (self.folder / "lock").open("a")
         except OSError as error:
             raise InputError(f"cannot be written: {error.strerror}", path=self.folder, hint="mapping=False") from None
-        if not _locked(self._lock):
+        if not _take_lock(self._lock):
             self._lock.close()
             hint = "one engine feeds a map; others localise in it: mapping=False"
             raise ConfigError("another process feeds this map", path=map_file, hint=hint)
@@ -192,7 +192,7 @@ def _main(map_file: str) -> None:
         print(json.dumps({"name": one.name, "revision": one.revision, "problem": one.problem}), flush=True)
 
 
-def _locked(file: Any) -> bool:
+def _take_lock(file: Any) -> bool:
     """Take the lock of a folder; False where another process has it."""
     try:
         import fcntl

@@ -6,7 +6,7 @@ they do next tells. A body moves as a whole, so its landmarks keep their distanc
 
     log odds of 'G and H are one body' = log prior odds + log E(G + H) - log E(G) - log E(H)
 
-and sets are joined as long as the odds are for it, the best pair first. `relabelled` gives a map other bodies.
+and sets are joined as long as the odds are for it, the best pair first. `relabel` gives a map other bodies.
 
 When one of the two chairs is carried away the other's detections speak for both, and the map would keep what is gone.
 So landmarks are compared with the others of their body (`without_missed`): from where the robot looked these were
@@ -79,7 +79,7 @@ class Displacements(NamedTuple):
     covariance_m2: FloatArray
 
 
-def regrouped(
+def regroup(
     clique_id: IntArray,
     class_id: IntArray,
     fate: IntArray,
@@ -115,7 +115,7 @@ def regrouped(
     label, moved, one_body = clique_id.copy(), [], _logit(settings.p_one_body)
     for name in np.unique(clique_id[fate != Fate.UNSEEN]):
         of_fate = {one: np.flatnonzero((clique_id == name) & (fate == one)) for one in Fate}
-        bodies = _joined([np.array([row]) for row in of_fate[Fate.MOVED]], log_evidence, lambda _a, _b: one_body)
+        bodies = _join_rows([np.array([row]) for row in of_fate[Fate.MOVED]], log_evidence, lambda _a, _b: one_body)
         moved += bodies
         parts = [*bodies, *(of_fate[one] for one in (Fate.STAYED, Fate.GONE) if len(of_fate[one]))]
         parts.sort(key=len, reverse=True)
@@ -135,13 +135,13 @@ def regrouped(
 
     # what did not move with its clique is a clique of its own by now, unless it was mistaken
     whole = [body for body in moved if (fate[(label == label[body[0]]) & (fate != Fate.UNSEEN)] == Fate.MOVED).all()]
-    for body in _joined(whole, log_evidence, log_prior):
+    for body in _join_rows(whole, log_evidence, log_prior):
         names = np.unique(label[body])
         label[np.isin(label, names)] = names[0]
     return label
 
 
-def _joined(
+def _join_rows(
     sets: Sequence[IntArray],
     log_evidence: Callable[[tuple[int, ...]], float],
     log_prior: Callable[[IntArray, IntArray], float],
@@ -216,14 +216,14 @@ def log_evidence_of_motion(
     return np.asarray(log_likelihood + log_prior - math.log(ALL_TURNS[axes]) + log_width)
 
 
-def squared_length(off: FloatArray, covariance: FloatArray) -> FloatArray:
+def square_lengths(off: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return (...,) squared Mahalanobis lengths of differences (..., D)."""
     return np.asarray(np.einsum("...i,...i->...", off, np.linalg.solve(covariance, off[..., None])[..., 0]))
 
 
 def log_density(off: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return (...,) log densities of differences (..., D) of mean zero."""
-    return np.asarray(-0.5 * (squared_length(off, covariance) + np.linalg.slogdet(2.0 * math.pi * covariance)[1]))
+    return np.asarray(-0.5 * (square_lengths(off, covariance) + np.linalg.slogdet(2.0 * math.pi * covariance)[1]))
 
 
 def _extent(position: FloatArray) -> float:
@@ -234,7 +234,7 @@ def _logit(p: float) -> float:
     return math.log(p / (1.0 - p))
 
 
-def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
+def relabel(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
     """Return the map after its landmarks (L,) were assigned to other cliques, new ones from `living.n_cliques_ever` on,
     and (P,) where each row of its places has gone.
 
@@ -251,7 +251,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     keeps = _keepers(site, owner, sites.clique_id[site])
     new_id = sites.site_id[site].copy()
     new_id[~keeps] = living.n_sites_ever + np.arange(np.count_nonzero(~keeps))
-    into = _united(owner, sites.clique_id[site], sites.p_here[site])
+    into = _unite_parts(owner, sites.clique_id[site], sites.p_here[site])
 
     p_here, p_kept = np.full((2, len(site)), np.inf)
     np.minimum.at(p_here, into, sites.p_here[site])
@@ -292,7 +292,7 @@ def _keepers(site: IntArray, owner: IntArray, before: IntArray) -> BoolArray:
     return keeps
 
 
-def _united(owner: IntArray, before: IntArray, p_here: FloatArray) -> IntArray:
+def _unite_parts(owner: IntArray, before: IntArray, p_here: FloatArray) -> IntArray:
     """Return the part into which every part is merged: itself, except for the likeliest parts of joined cliques."""
     into = np.arange(len(owner))
     for clique in np.unique(owner):
@@ -320,13 +320,15 @@ def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig
     usual_hits, usual_misses = (_at(counted, column) for column in (before.places.n_hits, before.places.n_misses))
     hits = _at(place, after.places.n_hits) - usual_hits
     misses = _at(place, after.places.n_misses) - usual_misses
-    p_missed = np.exp(-_owed(members.clique_id, usual_hits, usual_misses, hits, misses) / settings.misses_in_a_row)
+    p_missed = np.exp(
+        -_count_owed(members.clique_id, usual_hits, usual_misses, hits, misses) / settings.misses_in_a_row
+    )
     known = (place >= 0) & (counted >= 0)
     fate = np.select([known & (hits > 0), known & (p_missed < 0.5)], [Fate.STAYED, Fate.GONE], Fate.UNSEEN)
     if not (fate == Fate.GONE).any():
         return after
     nowhere, dim = np.zeros((len(members), after.dim)), after.dim
-    clique_id = regrouped(
+    clique_id = regroup(
         members.clique_id,
         members.class_id,
         fate,
@@ -338,7 +340,7 @@ def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig
     )
     if np.array_equal(clique_id, members.clique_id):
         return after
-    return relabelled(after, clique_id)[0]
+    return relabel(after, clique_id)[0]
 
 
 def _at(row: IntArray, column: IntArray) -> FloatArray:
@@ -346,7 +348,7 @@ def _at(row: IntArray, column: IntArray) -> FloatArray:
     return np.append(column, 0)[row].astype(np.float64)  # row -1 is the last
 
 
-def _owed(
+def _count_owed(
     clique_id: IntArray, usual_hits: FloatArray, usual_misses: FloatArray, hits: FloatArray, misses: FloatArray
 ) -> FloatArray:
     """(L,) detections of each landmark that its own rate until now, and what its fellows showed, lead to expect."""

@@ -264,7 +264,7 @@ def net(
         if forth and len(path) == 1 and len(names) == len(only.landmark_ids):
             found.append(only)
             continue
-        change = _composed(path, tuple(names), (a, b), settings)
+        change = _compose_changes(path, tuple(names), (a, b), settings)
         if change is not None and (forth or _possible(change.kind, before, after)):
             found.append(change)
     for change in (change for changes, _ in sessions for change in changes if change.kind is ChangeKind.REPLACED):
@@ -290,7 +290,7 @@ def _split_replacement(change: MapChange) -> tuple[MapChange, ...]:
 def grown(known: IntArray, b: LivingMap, changes: Iterable[MapChange]) -> IntArray:
     """Return (N,) ids of landmarks that are present in `b`, unknown before, and without a reported change."""
     told = [name for change in changes for name in change.landmark_ids]
-    stands = b.members.landmark_id[(b.told_site() != UNKNOWN) & ~b.members.deleted]
+    stands = b.members.landmark_id[(b.find_current_site() != UNKNOWN) & ~b.members.deleted]
     return np.setdiff1d(stands, np.concatenate([known, np.array(told, dtype=np.int64)]))
 
 
@@ -360,13 +360,13 @@ def with_swaps(found: Sequence[MapChange], after: LivingMap, settings: DecisionC
                     swapped[a] = b
     partners = set(swapped.values())
     return tuple(
-        _exchanged(change, found[swapped[k]]) if k in swapped else change
+        _join_exchange(change, found[swapped[k]]) if k in swapped else change
         for k, change in enumerate(found)
         if k not in partners
     )
 
 
-def _exchanged(change: MapChange, other: MapChange) -> MapChange:
+def _join_exchange(change: MapChange, other: MapChange) -> MapChange:
     """Combine two moves into one exchange; the displacement is that of the first."""
     return replace(
         change,
@@ -378,7 +378,7 @@ def _exchanged(change: MapChange, other: MapChange) -> MapChange:
     )
 
 
-def _composed(
+def _compose_changes(
     path: Sequence[Told], names: tuple[int, ...], maps: tuple[LivingMap, LivingMap], settings: DecisionConfig
 ) -> MapChange | None:
     """The net effect of changes of the same landmarks; None for none."""
@@ -456,7 +456,7 @@ def _poses(living: LivingMap, names: IntArray, dim: int) -> FloatArray:
     """
     pose = np.full((len(names), dim + TURNS[dim]), np.nan)
     _, row, at = np.intersect1d(names, living.members.landmark_id, return_indices=True)
-    told, best = living.told_site()[at], living.site_of()[at]
+    told, best = living.find_current_site()[at], living.site_of()[at]
     place = living.place_row(names[row], np.where(told == UNKNOWN, best, told))
     row, place = row[place >= 0], place[place >= 0]
     if len(row):
@@ -470,7 +470,7 @@ def _dim(a: LivingMap, b: LivingMap) -> int:
 
 
 def _standing(living: LivingMap) -> set[int]:
-    return set(living.members.landmark_id[living.told_site() != UNKNOWN].tolist())
+    return set(living.members.landmark_id[living.find_current_site() != UNKNOWN].tolist())
 
 
 def _possible(kind: ChangeKind, before: bool, after: bool) -> bool:

@@ -464,7 +464,7 @@ class LivingMap(Shown):
         site = np.append(self.sites.site_id[order[last]], UNKNOWN)
         return np.asarray(site[rows_among(clique[last], self.members.clique_id)])
 
-    def told_site(self) -> IntArray:
+    def find_current_site(self) -> IntArray:
         """Return (L,) `site_id` of the current stay of each landmark's clique; `UNKNOWN` if away.
 
         Of a clique without a stay, as in maps made by hand, its most probable site, if it more probably stands.
@@ -544,7 +544,7 @@ class LivingMap(Shown):
         size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]
         return np.asarray(blocks(self.covariance_m2, self.dim)[row] + size)
 
-    def sighted_rows(self, p_site: FloatArray) -> Landmarks:
+    def list_sighted(self, p_site: FloatArray) -> Landmarks:
         """Return every place as a record of its own, in the order of `places`: what a robot may meet, by the
         probability (S,) of every site.
         """

@@ -44,7 +44,7 @@ class Shelves(Generic[Table]):
     @classmethod
     def of(cls, table: Table) -> Self:
         """Put a table on shelves."""
-        return cls._of(table, _shelved(table))
+        return cls._of(table, _shelve(table))
 
     def __len__(self) -> int:
         return int(self.count.sum())
@@ -76,7 +76,7 @@ class Shelves(Generic[Table]):
             made += shelves[at : run[0]]
             at = int(run[-1]) + 1
             end = int(np.searchsorted(own, self.first[at])) if at < len(shelves) else len(own)
-            made += _shelved(spliced(self._read(run), keys, rows(new, np.arange(begin, end))))
+            made += _shelve(splice(self._read(run), keys, rows(new, np.arange(begin, end))))
             begin = end
         return type(self)._of(new, made + shelves[at:])
 
@@ -153,7 +153,7 @@ def rows(table: Table, some: Any) -> Table:
     return replace(table, **{name: getattr(table, name)[some] for name in columns(table)})
 
 
-def spliced(table: Table, gone: IntArray, new: Table) -> Table:
+def splice(table: Table, gone: IntArray, new: Table) -> Table:
     """Return a sorted table without the rows of some keys and with those of another one, which keeps its other
     fields. Of one key there are rows of one of them only.
     """
@@ -163,7 +163,7 @@ def spliced(table: Table, gone: IntArray, new: Table) -> Table:
     return replace(new, **told)
 
 
-def _shelved(table: Any) -> list[tuple[int, int, Part]]:
+def _shelve(table: Any) -> list[tuple[int, int, Part]]:
     """First key, number of rows, and values of each shelf of a table."""
     key = key_of(table)
     total, shelves = len(key), max(round(len(key) / ROWS), 1)

@@ -16,7 +16,7 @@ from evermap.config import LivingConfig
 from evermap.geometry.chunked import ChunkedCovariance, Update, blocks, of_places
 from evermap.maps.living import Dated, LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.maps.shelves import Sight, key_of, rows, spliced
+from evermap.maps.shelves import Sight, key_of, rows, splice
 from evermap.types import FloatArray, IntArray
 
 
@@ -81,13 +81,13 @@ class Vicinity:
         elsewhere = ~np.isin(whole.sites.site_id, before.sites.site_id)
         dated = Dated(whole.sites.site_id[elsewhere], whole.believed_s()[elsewhere])
         at_site = before.sites.site_id
-        places = spliced(whole.places, at_site, part.places)
+        places = splice(whole.places, at_site, part.places)
         sight = _sight(whole)
         lines, views = sight.lines.replaced(at_site, part.sightlines), sight.views.replaced(self.cells, part.views)
         return replace(
             part,
-            members=spliced(whole.members, before.members.landmark_id, part.members),
-            sites=spliced(whole.sites, at_site, part.sites),
+            members=splice(whole.members, before.members.landmark_id, part.members),
+            sites=splice(whole.sites, at_site, part.sites),
             places=places,
             dated=dated[dated.stamp_s < part.stamp_s],
             covariance_m2=self._covariance(part, places),
@@ -103,13 +103,13 @@ class Vicinity:
         """Return the joint covariance of all places after the session; unchanged for a session of looks alone."""
         whole = self.whole
         if part.covariance_m2 is self.part.covariance_m2:
-            return _chunked(whole)
+            return _part_in_chunks(whole)
         row = LivingMap.place_row(replace(part, places=places), part.places.landmark_id, part.places.site_id)
         was = whole.place_row(places.landmark_id, places.site_id)
         if not self.jointly:  # places were dropped, none is known better
-            return _chunked(whole).taken(was)
+            return _part_in_chunks(whole).taken(was)
         learned = of_places(part.covariance_m2, np.arange(len(part.places)), part.dim)
-        return _chunked(whole).updated(Update(places.position_m, was, row, learned))
+        return _part_in_chunks(whole).updated(Update(places.position_m, was, row, learned))
 
 
 def near(living: LivingMap, path_m: FloatArray, reach_m: float) -> tuple[IntArray, FloatArray]:
@@ -131,7 +131,7 @@ def cliques_of(living: LivingMap, landmark_id: IntArray) -> IntArray:
     return np.unique(living.members.clique_id[np.isin(living.members.landmark_id, landmark_id)])
 
 
-def predicted_of(living: LivingMap, landmark_id: IntArray, config: LivingConfig, until_s: float) -> FloatArray:
+def predict_sites(living: LivingMap, landmark_id: IntArray, config: LivingConfig, until_s: float) -> FloatArray:
     """Return (S,) probability of every site to be where its clique stands at a later instant; of a large map only what
     is believed of the cliques of some landmarks is told of that instant, the rest of when a session was last near.
     """
@@ -163,11 +163,11 @@ def in_chunks(living: LivingMap, config: LivingConfig) -> LivingMap:
         return living
     sight = _sight(living)
     return replace(
-        living, covariance_m2=_chunked(living), sightlines=sight.lines.like, views=sight.views.like, sight=sight
+        living, covariance_m2=_part_in_chunks(living), sightlines=sight.lines.like, views=sight.views.like, sight=sight
     )
 
 
-def _chunked(living: LivingMap) -> ChunkedCovariance:
+def _part_in_chunks(living: LivingMap) -> ChunkedCovariance:
     covariance = living.covariance_m2
     if isinstance(covariance, ChunkedCovariance):
         return covariance

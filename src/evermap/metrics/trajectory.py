@@ -74,7 +74,7 @@ def _mean_turn(source: FloatArray, target: FloatArray) -> FloatArray:
         turns = target[:, 2] - source[:, 2]
         return np.array([0.0, 0.0, np.arctan2(np.sin(turns).sum(), np.cos(turns).sum())])
     quaternion = se3.compose(target, se3.inverse(source))[:, 3:]
-    return se3.normalised([0.0, 0.0, 0.0, *np.linalg.eigh(quaternion.T @ quaternion).eigenvectors[:, -1]])
+    return se3.normalise_poses([0.0, 0.0, 0.0, *np.linalg.eigh(quaternion.T @ quaternion).eigenvectors[:, -1]])
 
 
 def rotate_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -293,12 +293,12 @@ def _rows_to_score(
         before, after = _neighbours(knots, truth.stamp_s[rows])
         found = rows[knots[after] - knots[before] <= max_gap_s]
     else:
-        known = np.flatnonzero(_supported(knots, truth.stamp_s, max_gap_s, looked_s))
+        known = np.flatnonzero(_is_supported(knots, truth.stamp_s, max_gap_s, looked_s))
         found = known[scored_stamps(rows_of(truth, known), knots[0] - slack_s, knots[-1] + slack_s, rate_hz)]
     return found, max(len(rows) - len(found), 0)
 
 
-def _supported(knot_s: FloatArray, stamp_s: FloatArray, max_gap_s: float, looked_s: FloatArray) -> BoolArray:
+def _is_supported(knot_s: FloatArray, stamp_s: FloatArray, max_gap_s: float, looked_s: FloatArray) -> BoolArray:
     """(K,) whether the poses on both sides of each stamp are near neighbours, or one is at the stamp itself."""
     missing = looked_s[~_same(knot_s, looked_s)]
     last = len(knot_s) - 1

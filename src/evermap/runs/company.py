@@ -59,19 +59,21 @@ class Company(Shown):
         names = tuple(sorted({name for site in sites for name in site.class_names}))
         if not names:
             raise DataError("no map has a stay to learn from", hint="maps with sessions: evermap map enter MAP INPUT")
-        stay, absence = (np.stack(parts) for parts in zip(*(_aligned(site, names) for site in sites), strict=True))
+        stay, absence = (
+            np.stack(parts) for parts in zip(*(_align_classes(site, names) for site in sites), strict=True)
+        )
         return cls(names, SitesPosterior.of(stay), SitesPosterior.of(absence, improper=True), tuple(sites))
 
     def lifetimes(self, site: int | None = None) -> dict[str, Lifetimes]:
         """Return the lifetimes of all classes at a site, '' for a class that no site has; None for a new site."""
-        of_stays, of_absences = (None, None) if site is None else _aligned(self.sites[site], self.class_names)
+        of_stays, of_absences = (None, None) if site is None else _align_classes(self.sites[site], self.class_names)
         stay, absence = self.stay.site(of_stays), self.absence.site(of_absences)
         rows = {name: row for row, name in enumerate(self.class_names) if name}
         rows[""] = self.class_names.index("") if "" in self.class_names else -1
         return {name: Lifetimes(stay.curve(row), absence.curve(row)) for name, row in rows.items()}
 
 
-def _aligned(site: ClassEvidence, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+def _align_classes(site: ClassEvidence, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
     """Log likelihoods (C, M, A) of stays and of absences of these classes; 0 of those that a site has not."""
     rows = [names.index(name) for name in site.class_names]
     stay, absence = (np.zeros((len(names), *part.shape[1:])) for part in (site.stay, site.absence))

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from evermap.io.landmarks import labels_of
-from evermap.io.table import guarded
+from evermap.io.table import guard
 from evermap.types import ChangeKind, Landmarks, MapChange, SlamResult
 from evermap.viz.map_figure import places_of
 
@@ -95,4 +95,4 @@ def _cell(value: Any) -> Any:
     """Return the cell of a value: empty if unknown, and without text that a spreadsheet would execute."""
     if isinstance(value, float):
         return repr(value) if math.isfinite(value) else ""
-    return guarded(value) if isinstance(value, str) else value
+    return guard(value) if isinstance(value, str) else value

@@ -90,7 +90,7 @@ def _reenter(store: SqlStore, work: Path, config: Config | None) -> Reentered:
     base = min(step.revision.parent for step in sessions)
     steps = sorted((step for step in steps if step.revision.number > base), key=lambda step: step.start_s)
     part, before = (work.with_name(f".{work.name}.{kind}") for kind in ("part", "before"))
-    earlier = max((path for path in (part, before, work) if path.exists()), key=_written_by, default=None)
+    earlier = max((path for path in (part, before, work) if path.exists()), key=_count_written, default=None)
     if earlier == part:
         earlier = part.replace(before)
     part.unlink(missing_ok=True)
@@ -130,7 +130,7 @@ def _enter_again(store: MapStore, fresh: MapStore, step: Step, living: LivingMap
     return session.living
 
 
-def _written_by(earlier: Path) -> int:
+def _count_written(earlier: Path) -> int:
     """How many revisions an earlier attempt has written after its revert; 0 of a file that cannot be read."""
     try:
         with open_store(earlier) as store:
@@ -153,7 +153,7 @@ def _take_over(earlier: Path | None, fresh: SqlStore, base: int, steps: Sequence
     """Copy what an earlier attempt has entered alike, from its first step on; returns the number of steps."""
     from evermap.maps.store.sql import SqlStore
 
-    if earlier is None or not _written_by(earlier):
+    if earlier is None or not _count_written(earlier):
         return 0
     with open_store(earlier) as old:
         assert isinstance(old, SqlStore)

@@ -230,7 +230,7 @@ def timing_dict(recording: AnyRecording, result: SlamResult, info: RunInfo) -> d
     step_ms = 1e3 * result.step_s
     p50, p99 = np.percentile(step_ms, [50, 99]) if len(step_ms) else (None, None)
     processing_s = float(np.sum(result.step_s)) if info.processing_s is None else info.processing_s
-    lasted_s = _processed_s(recording, result)
+    lasted_s = _find_processed_s(recording, result)
     return {
         "real_time_factor": lasted_s / processing_s if processing_s > 0 and lasted_s > 0 else None,
         "processing_s": processing_s,
@@ -271,7 +271,7 @@ def peak_memory_mb() -> float | None:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def _processed_s(recording: AnyRecording, result: SlamResult) -> float:
+def _find_processed_s(recording: AnyRecording, result: SlamResult) -> float:
     """Duration of the part that was processed."""
     done = result.online if len(result.online) else result.trajectory
     stamps = done.stamp_s if result.interrupted else recording.frames.stamp_s
@@ -281,7 +281,7 @@ def _processed_s(recording: AnyRecording, result: SlamResult) -> float:
 def _counts(recording: AnyRecording, result: SlamResult) -> dict[str, Any]:
     sightings = recording.robot_sightings
     return {
-        "duration_s": _processed_s(recording, result),
+        "duration_s": _find_processed_s(recording, result),
         "odometry_rows": 0 if recording.odometry is None else len(recording.odometry),
         "frames": len(recording.frames),
         "frames_processed": len(result.step_s),

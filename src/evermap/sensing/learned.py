@@ -251,11 +251,11 @@ def confirm(
     there = in_view & (belief > sure[1]) & (seen.p_occluded < p_occluded)
     gone = in_view & (belief < sure[0])
     pending, log_chain = model.pending.copy(), model.log_chain.copy()
-    learned = _collected(model.profile, there, gone, pending, log_chain)
+    learned = _collect_pending(model.profile, there, gone, pending, log_chain)
     return replace(model, profile=learned, pending=pending, log_chain=log_chain)
 
 
-def _collected(
+def _collect_pending(
     profile: Profile, there: BoolArray, gone: BoolArray, pending: FloatArray, log_chain: FloatArray
 ) -> Profile:
     """Return the profile with what pends of certain cliques, which is taken from there in place."""

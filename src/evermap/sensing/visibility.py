@@ -56,7 +56,7 @@ class NominalField:
     def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
         """Return (F, L) probabilities of landmarks (L, 2) from robot poses (F, 3) in the same frame."""
         none = np.zeros(0, dtype=np.int64)
-        listed = self._listed(pose, position_m, (none, none), -1.0, math.inf)
+        listed = self._list_seen(pose, position_m, (none, none), -1.0, math.inf)
         return listed.p_detect.reshape(len(pose), len(position_m))
 
     def looks(self, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray]) -> LooksAt:
@@ -68,9 +68,9 @@ class NominalField:
             seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
         """
         least = self.settings.worth_a_look * self.sensor.p_detect
-        return self._listed(pose, position_m, seen, least, float(self.reach_m))
+        return self._list_seen(pose, position_m, seen, least, float(self.reach_m))
 
-    def _listed(
+    def _list_seen(
         self, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray], least: float, reach_m: float
     ) -> LooksAt:
         """Return what was seen, and what is in reach and detected with some probability at least."""

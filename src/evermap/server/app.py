@@ -36,7 +36,7 @@ from evermap.server.database import AWAY, Job, JobState, Role
 from evermap.server.events import describe_revision, find_head, follow_map
 from evermap.server.gate import PAGE, Gate, PlainJSON, answer_mistake, answer_outage, answer_unread, server_of
 from evermap.server.state import Server
-from evermap.server.uploads import checked_digest
+from evermap.server.uploads import check_digest
 from evermap.types import json_number
 
 _LEAST_COMPRESSED = 1000
@@ -64,10 +64,10 @@ def _told(request: Request, site: str, make: Callable[[SqlStore], Any]) -> Respo
     """Answer from a map alone, unchanged until there is a newer revision."""
     asked = f"{request.url.path}?{request.url.query}"
     tag, found = server_of(request).sites.answer(site, asked, lambda store: bytes(PlainJSON(make(store)).body))
-    return _tagged(request, found, tag, "application/json")
+    return _tag_answer(request, found, tag, "application/json")
 
 
-def _tagged(request: Request, data: bytes, tag: str, media_type: str, **headers: str) -> Response:
+def _tag_answer(request: Request, data: bytes, tag: str, media_type: str, **headers: str) -> Response:
     """Return an answer with its ETag, or 304 if the client has it."""
     told = {"ETag": f'"{tag}"', **headers}
     if told["ETag"] in request.headers.get("if-none-match", ""):
@@ -211,7 +211,7 @@ async def upload(request: Request, response: Response, site: Site, server: Answe
     server.sites.address(site)
     data = await request.body()
     async with server.unpacking:
-        digest = await run_in_threadpool(checked_digest, data, server.limits)
+        digest = await run_in_threadpool(check_digest, data, server.limits)
     job, fresh = await run_in_threadpool(server.database.enqueue, site, digest, data, who)
     response.status_code = 202 if fresh else 200
     return asdict(job)
@@ -352,13 +352,13 @@ def map_file(
 ) -> Response:  # fmt: skip
     """Return the map as one file, of a revision, of the approved one, or of the newest."""
     if approved:
-        revision = _approved(server, site)
+        revision = _find_approved(server, site)
     found = server.sites.file(site, revision)
     told = {"X-Checksum-Sha256": found.sha256, "Content-Disposition": f'attachment; filename="{site}.evermap"'}
-    return _tagged(request, found.data, found.tag, "application/vnd.sqlite3", **told)
+    return _tag_answer(request, found.data, found.tag, "application/vnd.sqlite3", **told)
 
 
-def _approved(server: Server, site: str) -> int:
+def _find_approved(server: Server, site: str) -> int:
     server.sites.address(site)  # PostgreSQL takes no zero bytes, as what is no name may hold
     chosen = server.database.approved(site)
     if chosen is None:
@@ -384,7 +384,7 @@ def actions(request: Request, site: Site, server: Answering, _: Reader, robot: R
 
     For a named robot, only the missing ones, by the maps that it reported.
     """
-    number = _approved(server, site)
+    number = _find_approved(server, site)
     told = [one for item in server.database.robots() if item["robot"] == robot for one in item["maps"]]
     held = {one["mapStatus"] for one in told if (one["mapId"], one["mapVersion"]) == (site, str(number))}
     which = {"mapId": site, "mapVersion": str(number)}

@@ -52,7 +52,7 @@ def _given(**kinds: Any) -> list[sa.Column[Any]]:
     return [sa.Column(name, kind, nullable=False) for name, kind in kinds.items()]
 
 
-def _numbered() -> sa.Column[int]:
+def _number_rows() -> sa.Column[int]:
     return sa.Column("id", sa.Integer, primary_key=True)
 
 
@@ -67,7 +67,7 @@ _token = sa.Table(
 _job = sa.Table(
     "job",
     metadata,
-    _numbered(),
+    _number_rows(),
     *_given(site=sa.Text, digest=sa.Text, n_bytes=sa.Integer, robot=sa.Text),
     sa.Column("state", sa.Text, nullable=False, index=True),
     sa.Column("reason", sa.Text, nullable=False, default=""),
@@ -84,12 +84,12 @@ _open_jobs = sa.Index("ix_job_open", _job.c.id, postgresql_where=_open_job, sqli
 """Those that may be leased: of a million sessions that are entered, no lease looks at one."""
 _payload = sa.Table("payload", metadata, sa.Column("job", sa.Integer, primary_key=True), *_given(data=sa.LargeBinary))
 _approval = sa.Table(
-    "approval", metadata, _numbered(), *_given(site=sa.Text, revision=sa.Integer, who=sa.Text, at=sa.Text)
+    "approval", metadata, _number_rows(), *_given(site=sa.Text, revision=sa.Integer, who=sa.Text, at=sa.Text)
 )
 _robot = sa.Table(
     "robot", metadata, sa.Column("name", sa.Text, primary_key=True), *_given(maps=sa.Text, told=sa.Integer, at=sa.Text)
 )
-_audit = sa.Table("audit", metadata, _numbered(), *_given(at=sa.Text, who=sa.Text, what=sa.Text, status=sa.Integer))
+_audit = sa.Table("audit", metadata, _number_rows(), *_given(at=sa.Text, who=sa.Text, what=sa.Text, status=sa.Integer))
 
 
 def _migrate(connection: sa.Connection) -> int | None:
@@ -430,7 +430,7 @@ class Database:
         self._engine.dispose()
 
 
-def approved_of(where: str | Path) -> int | None:
+def find_approved(where: str | Path) -> int | None:
     """Return the approved revision of a map in the store of a server; None if there is none, or no server.
 
     Args:

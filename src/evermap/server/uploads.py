@@ -73,14 +73,14 @@ class UploadLimits:
     body_bytes: int = 1_000_000
 
 
-def checked_digest(data: bytes, limits: UploadLimits) -> str:
+def check_digest(data: bytes, limits: UploadLimits) -> str:
     """Return the SHA-256 of the session in an upload, independent of its packing.
 
     Raises:
         InputError: it is neither a zip of a native folder or of a bag, nor a bag, or may harm who reads it.
     """
     digest = hashlib.sha256()
-    with _opened(data, limits) as files:
+    with _open_files(data, limits) as files:
         for name, (told, file) in sorted(files.items()):
             with file() as content:
                 _check(content, told, limits)
@@ -96,7 +96,7 @@ _Files = dict[str, tuple[str, Callable[[], IO[bytes]]]]
 
 
 @contextmanager
-def _opened(data: bytes, limits: UploadLimits) -> Iterator[_Files]:
+def _open_files(data: bytes, limits: UploadLimits) -> Iterator[_Files]:
     """Yield the files that a recording is read from; a bag that is one file always has the same name."""
     for ending, start in _BAGS.items():
         if data.startswith(start):
@@ -190,7 +190,7 @@ def recording_of(data: bytes, digest: str) -> AnyRecording:
     with tempfile.TemporaryDirectory(prefix="evermap-upload-") as folder:
         path = Path(folder) / f"session-{digest[:12]}"
         try:
-            with _opened(data, UploadLimits()) as files:
+            with _open_files(data, UploadLimits()) as files:
                 is_bag = any(name.endswith((*_BAGS,)) for name in files)
                 bag = _unpacked(files, path) if is_bag else {}
             if is_bag:

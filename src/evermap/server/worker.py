@@ -94,7 +94,7 @@ class Worker:
         if claimed is None:
             return None
         job, data = claimed
-        with self._leased(job):
+        with self._keep_lease(job):
             if job.tries >= MOST_TRIES:
                 outcome = JobOutcome(JobState.REJECTED, f"{job.tries} workers crashed on it")
             else:
@@ -139,7 +139,7 @@ class Worker:
             return JobOutcome(JobState.REJECTED, f"a bug in evermap: {type(error).__name__}: {error}")
 
     @contextmanager
-    def _leased(self, job: Job) -> Iterator[None]:
+    def _keep_lease(self, job: Job) -> Iterator[None]:
         """Renew the lease as long as the block runs."""
         done = threading.Event()
 

@@ -21,10 +21,10 @@ from evermap.config import LocalizeConfig, SlamConfig
 from evermap.errors import NumericalError
 from evermap.estimate.measurement import Tied
 from evermap.estimate.noise import Turns, alternate
-from evermap.estimate.sparse.system import Slices, exhausted
+from evermap.estimate.sparse.system import Slices, exhaust
 from evermap.geometry import se2, se3
 from evermap.slam.bridge import dead_reckoned
-from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior, needed, seated
+from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior, needed, seat_sensor
 from evermap.slam.method import Explanation, Method
 from evermap.slam.noise import Extrapolation, NoiseFit, learn_noise_by_range, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
@@ -173,7 +173,7 @@ class Batch:
         while done < whole:
             count = min(done + more, whole)
             some = problem.until(count)
-            smoother, found, marginals = self._led_on(some, estimate, noise)
+            smoother, found, marginals = self._lead_on(some, estimate, noise)
             # half a nat for each number that was measured, or what it was before
             cost = smoother.cost(found) / (len(some.pose_row) + 1.5 * count)
             good = cost < max(1.0, MOST_WORSE * share)
@@ -189,18 +189,18 @@ class Batch:
                 noise = refine_noise(some, estimate, marginals, weights, noise, self._start_noise, scoring=True).noise
             yield SolvedPart(some, estimate, noise, fits)
 
-    def _led_on(self, problem: Problem, before: Estimate, noise: Noise) -> tuple[Smoother, Estimate, Marginals]:
+    def _lead_on(self, problem: Problem, before: Estimate, noise: Noise) -> tuple[Smoother, Estimate, Marginals]:
         """The optimum of more poses than those of the values before."""
-        smoother, start = Smoother(problem, noise, heavy=True, robust=self._robust), _led_on(problem, before, noise)
+        smoother, start = Smoother(problem, noise, heavy=True, robust=self._robust), _lead_on(problem, before, noise)
         steps, settled = STEPS_A_PART, NEAR_GAIN * len(problem.pose_row)
-        estimate, marginals = exhausted(
-            smoother.solved_in_slices(start, iterations=steps, tolerance=NEAR, settled=settled)
+        estimate, marginals = exhaust(
+            smoother.solve_in_slices(start, iterations=steps, tolerance=NEAR, settled=settled)
         )
         if self._robust:
-            moved = exhausted(voted(smoother, estimate, self._settings.fewest_sightings))
+            moved = exhaust(voted(smoother, estimate, self._settings.fewest_sightings))
             if moved is not estimate:
-                estimate, marginals = exhausted(
-                    smoother.solved_in_slices(moved, iterations=steps, tolerance=NEAR, settled=settled)
+                estimate, marginals = exhaust(
+                    smoother.solve_in_slices(moved, iterations=steps, tolerance=NEAR, settled=settled)
                 )
         return smoother, estimate, marginals
 
@@ -233,15 +233,15 @@ class Batch:
             aligned: whether the frame is that of a prior map.
             near: whether the values are so near that it shows what is an outlier.
         """
-        free, start = self._method.unprejudiced(problem, estimate)
+        free, start = self._method.unprejudice(problem, estimate)
         near, problem, estimate = near and free is problem, free, start
         if self._robust and not near:  # a landmark whose first sighting was misread may be disputed since
             smoother = Smoother(problem, noise, heavy=True)
-            estimate = exhausted(voted(smoother, estimate, self._settings.fewest_sightings))
-        found = self._settled(Smoother(problem, noise, robust=self._robust), problem, estimate, noise, heavy=not near)
+            estimate = exhaust(voted(smoother, estimate, self._settings.fewest_sightings))
+        found = self._settle(Smoother(problem, noise, robust=self._robust), problem, estimate, noise, heavy=not near)
         if self._robust:
-            rejoined = _rejoined(found.smoother, found.estimate, self._settings)
-            found = self._readmitted(found, rejoined)
+            rejoined = _rejoin(found.smoother, found.estimate, self._settings)
+            found = self._readmit(found, rejoined)
         found = self._with_noise_by_range(found)
         problem = found.smoother.problem
         if self._robust:
@@ -253,7 +253,7 @@ class Batch:
                 break
             problem, levels = revision.problem, found.noise.noise
             smoother = Smoother(problem, levels, robust=self._robust)
-            found = self._settled(smoother, problem, revision.estimate, levels, heavy=True)
+            found = self._settle(smoother, problem, revision.estimate, levels, heavy=True)
             estimate = found.estimate
         # near enough to tell which states are needed; then all of them are sought together
         worth = found.smoother.worth(found.estimate, found.marginals)
@@ -262,9 +262,9 @@ class Batch:
             prior, states = problem.prior.averaged(p_needed, estimate.states, np.diag(found.marginals.states), worth)
             problem, estimate = replace(problem, prior=prior), _at_states(estimate, found.marginals, states)
         problem, estimate = self._ahead(problem, estimate, aligned=aligned)
-        found = self._settled(found.smoother, problem, estimate, found.noise.noise, ahead=found.ahead, final=True)
+        found = self._settle(found.smoother, problem, estimate, found.noise.noise, ahead=found.ahead, final=True)
         if self._robust:  # means may lie so far from the estimate that true sightings are rejected on the way
-            found = self._readmitted(found, found.estimate, tried, final=True)
+            found = self._readmit(found, found.estimate, tried, final=True)
         solved = found.smoother, found.estimate, found.marginals
         ahead, estimate = self._ahead(found.smoother.problem, found.estimate, aligned=aligned)
         if ahead is not found.smoother.problem:
@@ -284,18 +284,18 @@ class Batch:
             problem, noise = learn_noise_by_range(before, estimate, found.marginals, weights, smoother.noise, share)
             if problem is before:
                 break
-            found = self._settled(smoother, problem, estimate, noise, ahead=found.ahead)
+            found = self._settle(smoother, problem, estimate, noise, ahead=found.ahead)
         return found
 
-    def _readmitted(
+    def _readmit(
         self, found: FoundOptimum, estimate: Estimate, tried: BoolArray | None = None, *, final: bool = False
     ) -> FoundOptimum:
-        """What was found, or what is from these values or where sightings that were rejected lead (`_readmitted`)."""
-        better = _readmitted(found.smoother, estimate, self._settings, tried)
+        """What was found, or what is from these values or where sightings that were rejected lead (`_readmit`)."""
+        better = _readmit(found.smoother, estimate, self._settings, tried)
         if better is found.estimate:
             return found
         smoother = found.smoother
-        return self._settled(smoother, smoother.problem, better, found.noise.noise, heavy=not final, final=final)
+        return self._settle(smoother, smoother.problem, better, found.noise.noise, heavy=not final, final=final)
 
     def _ahead(self, problem: Problem, estimate: Estimate, *, aligned: bool) -> tuple[Problem, Estimate]:
         """Return the same, rotated so that the first pose has the robot's front ahead, unless it is in a map."""
@@ -306,7 +306,7 @@ class Batch:
         turn = se2.compose(start, se2.inverse(problem.start_pose))
         return replace(problem, start_pose=start), estimate.moved(turn)
 
-    def _settled(
+    def _settle(
         self,
         smoother: Smoother,
         problem: Problem,
@@ -338,8 +338,8 @@ class Batch:
             last, start = (smoother, estimate) if before is None else before[:2]
             at = last.under(levels, heavy=heavy, problem=problem)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
-            solved = at.solved_in_slices(start, iterations=steps, tolerance=tolerance, settled=settled)
-            return _Solution(at, *exhausted(solved))
+            solved = at.solve_in_slices(start, iterations=steps, tolerance=tolerance, settled=settled)
+            return _Solution(at, *exhaust(solved))
 
         def learn(found: _Solution, levels: Noise) -> tuple[NoiseFit, float]:
             weights = found.smoother.inlier_probability(found.estimate)
@@ -376,7 +376,7 @@ def _first_part(count: int) -> int:
     return count
 
 
-def _led_on(problem: Problem, estimate: Estimate, noise: Noise) -> Estimate:
+def _lead_on(problem: Problem, estimate: Estimate, noise: Noise) -> Estimate:
     """Return values of all poses, those beyond the estimate's by odometry, and of all landmarks they saw.
 
     A new landmark is where its prior or the median of its sightings puts it.
@@ -387,7 +387,7 @@ def _led_on(problem: Problem, estimate: Estimate, noise: Noise) -> Estimate:
     landmark = estimate.landmark.copy()
     new = np.isnan(landmark[problem.landmark_row, 0])
     theirs = problem.seeing(new)
-    at = sighted_at(pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
+    at = sight_at(pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
     middle = middles(theirs.landmark_row, at, len(landmark))
     return Estimate(pose, np.where(np.isnan(landmark), middle, landmark), estimate.states)
 
@@ -462,7 +462,7 @@ def lay_over_in_metre(
         return estimate, prior, laid
     scale = float(np.exp(log_scale))
     pose, landmark = estimate.pose * [scale, scale, 1.0], estimate.landmark * scale
-    scaled = Estimate(pose, landmark, prior.resized(estimate.states, scale))
+    scaled = Estimate(pose, landmark, prior.resize(estimate.states, scale))
     again = lay_over(prior_map, scaled.landmark, rules, fewest=rules.fewest)
     if not again or (laid and np.count_nonzero(again.agree) <= np.count_nonzero(laid.agree)):
         return estimate, prior, laid
@@ -545,7 +545,7 @@ def divided(
     )
 
 
-def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:
+def sight_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:
     """Return positions (..., 2) that readings (..., 2) of range and bearing from poses (..., 3) point to.
 
     The range law is inverted at the corrected bearing.
@@ -554,16 +554,16 @@ def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount:
     gain = 1.0 + states[1] + states[2] * bearing + states[3] * bearing**2
     range_m = (reading[..., 0] - states[0]) / gain
     in_sensor = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
-    return se2.transform(se2.compose(pose, seated(mount, states)), in_sensor)
+    return se2.transform(se2.compose(pose, seat_sensor(mount, states)), in_sensor)
 
 
 def voted(smoother: Smoother, estimate: Estimate, fewest: int) -> Slices[Estimate]:
-    """Return what `outvoted` does, by the weights that the detections have there."""
-    now = yield from smoother.linearised_in_slices(estimate)
-    return outvoted(smoother.problem, estimate, now.weights[DETECTIONS], fewest)
+    """Return what `outvote` does, by the weights that the detections have there."""
+    now = yield from smoother.linearise_in_slices(estimate)
+    return outvote(smoother.problem, estimate, now.weights[DETECTIONS], fewest)
 
 
-def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> Estimate:
+def _rejoin(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> Estimate:
     """Return a better optimum where the odometry was silent, if the landmarks that both sides saw lead to one.
 
     After a silence the robot may be anywhere: sightings that disagree with where it was taken to go on look like
@@ -577,7 +577,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
     cost = smoother.cost(estimate)
     for first, last in sorted(tried):
         piece = (problem.pose_row >= first) & (problem.pose_row < last)
-        at = sighted_at(estimate.pose[problem.pose_row], problem.reading, estimate.states, problem.mount)
+        at = sight_at(estimate.pose[problem.pose_row], problem.reading, estimate.states, problem.mount)
         mine, theirs = (
             middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
         )
@@ -599,9 +599,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate, settings: SlamConfig) -> E
     return estimate
 
 
-def _readmitted(
-    smoother: Smoother, estimate: Estimate, settings: SlamConfig, tried: BoolArray | None = None
-) -> Estimate:
+def _readmit(smoother: Smoother, estimate: Estimate, settings: SlamConfig, tried: BoolArray | None = None) -> Estimate:
     """Return a better optimum where a landmark was rejected several times in a row, if narrowing noise leads to one.
 
     Where odometry alone led astray, the sightings that contradict it are rejected together, and none of them can pull
@@ -654,7 +652,7 @@ def middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
     return middle
 
 
-def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: int) -> Estimate:
+def outvote(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: int) -> Estimate:
     """Move landmarks to the median of their sightings where most sightings disagree with them.
 
     A landmark whose first sighting carried the wrong identity starts in the wrong place, from where all right
@@ -668,6 +666,6 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray, fewest: 
     if not disputed.any():
         return estimate
     theirs = problem.seeing(disputed[problem.landmark_row] & votes)
-    at = sighted_at(estimate.pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
+    at = sight_at(estimate.pose[theirs.pose_row], theirs.reading, estimate.states, problem.mount)
     middle = middles(theirs.landmark_row, at, len(disputed))
     return replace(estimate, landmark=np.where(disputed[:, None], middle, estimate.landmark))

@@ -3,8 +3,8 @@
 Between two measured instants only odometry speaks. Dead reckoning from both ends, each weighted by how uncertain it
 is by then, is the exact posterior of the linearised chain: a pose in the middle of a blind stretch follows the
 odometry's shape, shares out its closing error in proportion to the noise that was collected, and carries a covariance
-that swells in the middle. In the plane and in space this is `condition_on_ends`; `bridged` is for the odometry of the
-plane, `space.bridge` for that of space.
+that swells in the middle. In the plane and in space this is `condition_on_ends`; `bridge_poses` is for the odometry of
+the plane, `space.bridge` for that of space.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def joint_of_ends(before: FloatArray, after: FloatArray, across: FloatArray) -> 
     )
 
 
-def bridged(
+def bridge_poses(
     stamp_s: FloatArray,
     pose_stamp_s: FloatArray,
     pose: FloatArray,
@@ -97,7 +97,7 @@ def _between_ends(
     states: FloatArray,
     noise: Noise,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what `bridged` does, at stamps (K,) that are no poses', which follow poses `before` (K,), or -1."""
+    """Return what `bridge_poses` does, at stamps (K,) that are no poses', which follow poses `before` (K,), or -1."""
     pose_stamp_s, pose, covariance, consecutive = ends
     n = len(pose)
     increment, collected = np.zeros((2, len(stamp_s), 3)), np.zeros((2, len(stamp_s), 3, 3))

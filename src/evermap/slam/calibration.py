@@ -167,7 +167,7 @@ class CalibrationPrior:
         asked = self.free & ~np.isnan(p_needed)
         p, before = np.where(asked, np.clip(p_needed, self.settings.p_spare, 1.0), 1.0), 1.0 / self.sigma**2
         data = np.maximum(1.0 / np.where(self.free, variance, self.sigma**2) - before, 1e-9 * before)
-        information = np.where(asked, narrowed(p, before, data, data / worth), before)
+        information = np.where(asked, narrow(p, before, data, data / worth), before)
         prior = replace(self.spared(p_needed), sigma=1.0 / np.sqrt(information))
         share = np.where(prior.free, (data + before) / (data + information), 0.0)
         return prior, self.mean + share * (states - self.mean)
@@ -205,7 +205,7 @@ class CalibrationPrior:
         sigma[SLOPE], free[SLOPE] = max(slope_sigma, LEAST_SIGMA), slope_sigma > 0.0
         return replace(self, sigma=sigma, free=free)
 
-    def mounted_as_stated(self) -> CalibrationPrior:
+    def mount_as_stated(self) -> CalibrationPrior:
         """Return the prior with the sensor where it is stated to sit."""
         free = self.free.copy()
         free[AHEAD : ASIDE + 1] = False
@@ -252,7 +252,7 @@ class CalibrationPrior:
         believed = self.sigma[SLOPE] ** 2 / (self.sigma[SLOPE] ** 2 + self.sigma[FORWARD] ** 2)
         return float(believed if self.slope_share is None else self.slope_share)
 
-    def resized(self, states: FloatArray, factor: float) -> FloatArray:
+    def resize(self, states: FloatArray, factor: float) -> FloatArray:
         """Return states (11,) that explain every reading as well where all lengths are so many times as long.
 
         Those that are held stay, but the two that are only known as a product: range slope and odometer scale.
@@ -288,7 +288,7 @@ class CalibrationPrior:
         told = np.array([self.metre(states, covariance), *others])
         weight, spread = told[:, 2] / told[:, 2].sum(), 1.0 / told[:, 2].sum()
         log_slope, variance = float(weight @ told[:, 0]), spread + float(weight**2 @ told[:, 1])
-        states = self.resized(states, float(np.exp(-log_slope)))
+        states = self.resize(states, float(np.exp(-log_slope)))
         # the unobservable part keeps the prior's spread; the product has its own
         by_forward, by_slope = weight[0] * self._slope_share, weight[0] * (1.0 - self._slope_share)
         own, drives = covariance[SLOPE, SLOPE], covariance[FORWARD, FORWARD]
@@ -334,11 +334,11 @@ class CalibrationPrior:
         if askew == 0.0:
             return np.zeros(3)
         c, s = math.cos(askew), math.sin(askew)
-        x, y = seated(mount, states)[:2].tolist()
+        x, y = seat_sensor(mount, states)[:2].tolist()
         return np.array([x - c * x - s * y, y + s * x - c * y, -askew])  # turned about the sensor
 
 
-def narrowed(
+def narrow(
     p_needed: FloatArray | float, before: FloatArray | float, data: FloatArray | float, told: FloatArray | float
 ) -> FloatArray:
     """Return the information of a prior whose estimate is the mean over 'as stated' and 'drawn from a wider prior'.
@@ -352,8 +352,8 @@ def narrowed(
     return np.asarray(data * ((told + before) / (p_needed * told) - 1.0))
 
 
-def priced(value: float, variance: float, worth: float, sigma: float, p_needed: float = 0.5) -> tuple[float, float]:
-    """Return the probability that a state is drawn from its prior, not as stated, and the `narrowed` information.
+def price(value: float, variance: float, worth: float, sigma: float, p_needed: float = 0.5) -> tuple[float, float]:
+    """Return the probability that a state is drawn from its prior, not as stated, and the `narrow` information.
 
     Args:
         value: the estimate under the prior, less what is stated.
@@ -368,10 +368,10 @@ def priced(value: float, variance: float, worth: float, sigma: float, p_needed: 
     log_odds = 0.5 * (told * best) ** 2 / (told + before) - 0.5 * np.log1p(told / before)
     log_odds += np.log(p_needed / (1.0 - p_needed))
     p = float(1.0 / (1.0 + np.exp(-log_odds)))
-    return p, float(narrowed(p, before, data, told))
+    return p, float(narrow(p, before, data, told))
 
 
-def seated(mount: FloatArray, states: FloatArray) -> FloatArray:
+def seat_sensor(mount: FloatArray, states: FloatArray) -> FloatArray:
     """Return the pose (3,) of the sensor on the robot, of a stated mount (3,) and calibration states (11,).
 
     The angle is as stated: that of bearings is `bearing_bias_rad`.

@@ -143,9 +143,9 @@ def findings(recording: AnyRecording, settings: SlamConfig = DEFAULTS) -> tuple[
     The limits of its sensors are in force.
     """
     if is_in_space(recording):
-        left_out = _left_out_in_space(recording, settings)
+        left_out = _find_left_out_in_space(recording, settings)
     else:
-        left_out = _left_out_in_plane(recording, settings)
+        left_out = _find_left_out_in_plane(recording, settings)
     found = [*left_out, *find_misreadings(recording, settings)]
     return tuple(sorted(found, key=lambda finding: finding.usable))
 
@@ -203,7 +203,7 @@ def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
         "detections": {
             "count": len(detections),
             "without_identity": int(np.sum(~known)),
-            **(_seen_in_space(recording) if is_in_space(recording) else _seen(recording)),
+            **(_find_seen_in_space(recording) if is_in_space(recording) else _seen(recording)),
         },
         "landmarks": {
             "count": len(of_landmark),
@@ -256,7 +256,7 @@ def _seen(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _seen_in_space(recording: SpatialRecording) -> dict[str, Any]:
+def _find_seen_in_space(recording: SpatialRecording) -> dict[str, Any]:
     detections = recording.detections
     range_m = _ranges(recording)
     ranged = range_m[np.isfinite(range_m)]
@@ -363,7 +363,7 @@ def _find_corner_order(recording: SpatialRecording, settings: CheckConfig) -> li
     return [Finding("corner-order", CORNERS[how].message, usable=False)] if how else []
 
 
-def _left_out_in_plane(recording: Recording, settings: SlamConfig) -> list[Finding]:
+def _find_left_out_in_plane(recording: Recording, settings: SlamConfig) -> list[Finding]:
     """Return detections that the estimator cannot use, and whether there are too few others."""
     from evermap.slam.intake import prepare
     from evermap.slam.ranges import with_bearings
@@ -379,7 +379,7 @@ def _left_out_in_plane(recording: Recording, settings: SlamConfig) -> list[Findi
     return [Finding("left-out", remark) for remark in remarks]
 
 
-def _left_out_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
+def _find_left_out_in_space(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
     """Return detections that the estimator cannot use. Boxes without identity are associated by position."""
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic
@@ -487,8 +487,8 @@ def valid(recording: AnyRecordingT, sensor: SensorConfig, prior_map: Landmarks |
 
 def _with_sensors(recording: AnyRecordingT, sensor: SensorConfig) -> AnyRecordingT:
     if recording.dim == 3:
-        return replace(recording, sensors=sensor.applied_in_space(recording.sensors))
-    return replace(recording, sensor=sensor.applied_to(recording.sensor))
+        return replace(recording, sensors=sensor.apply_in_space(recording.sensors))
+    return replace(recording, sensor=sensor.apply_to(recording.sensor))
 
 
 def leave_out_riders_in_space(recording: Any, settings: SlamConfig) -> tuple[Any, tuple[Finding, ...]]:

@@ -57,7 +57,7 @@ def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
 
 def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) -> Odometry:
     """Possible velocities at increasing stamps."""
-    stamps = _mended("odometry", odometry.stamp_s, settings, remarks)
+    stamps = _mend_stamps("odometry", odometry.stamp_s, settings, remarks)
     order = np.argsort(stamps, kind="stable")
     order = order[np.isfinite(stamps[order])]
     last = np.append(stamps[order][1:] != stamps[order][:-1], True)[: len(order)]
@@ -121,7 +121,7 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
 def _in_time(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Recording:
     """Frames at increasing stamps, those with equal stamps united, and detections sorted by frame."""
     frames, detections = recording.frames, recording.detections
-    stamps = _mended("sensor", frames.stamp_s, settings, remarks)
+    stamps = _mend_stamps("sensor", frames.stamp_s, settings, remarks)
     instants: FloatArray = np.unique(stamps[np.isfinite(stamps)])
     sorted_already = np.all(np.diff(detections.frame) >= 0)
     if len(instants) == len(frames) and np.array_equal(instants, frames.stamp_s) and sorted_already:
@@ -147,16 +147,16 @@ def _one_clock(recording: Recording, settings: CleaningConfig, remarks: list[str
     for _ in range(len(frames)):
         step = set_forward(frames.stamp_s, odometry.stamp_s, settings)
         if step is not None:
-            frames = replace(frames, stamp_s=_taken_back(frames.stamp_s, step, "sensor", remarks))
+            frames = replace(frames, stamp_s=_take_back(frames.stamp_s, step, "sensor", remarks))
             continue
         step = set_forward(odometry.stamp_s, frames.stamp_s, settings)
         if step is None:
             break
-        odometry = replace(odometry, stamp_s=_taken_back(odometry.stamp_s, step, "odometry", remarks))
+        odometry = replace(odometry, stamp_s=_take_back(odometry.stamp_s, step, "odometry", remarks))
     return replace(recording, frames=frames, odometry=odometry)
 
 
-def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks: list[str]) -> FloatArray:
+def _take_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks: list[str]) -> FloatArray:
     row, by_s = step
     remarks.append(f"clock of the {what} was set forward by {by_s:.1f} s, undone")
     return np.append(stamp_s[:row], stamp_s[row:] - by_s)
@@ -248,12 +248,12 @@ def _fresh(recording: Recording, settings: CleaningConfig, remarks: list[str]) -
     repeated = (count > 0) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
     least = np.where(count > 1, 1.0, SINGLE) * settings.moved
     since = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames))))
-    repeated &= _moved_since(since, frames, odometry, least)
+    repeated &= _has_moved_since(since, frames, odometry, least)
     _remark(remarks, "frames dropped that repeat the previous one although the robot moved", int(repeated.sum()))
     return some_frames(recording, ~repeated) if repeated.any() else recording
 
 
-def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatArray) -> BoolArray:
+def _has_moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatArray) -> BoolArray:
     """Return (F,) whether the robot drove or turned by more than `most` since the frames in `row` (F,)."""
     speed = np.stack([np.hypot(odometry.forward_mps, odometry.lateral_mps), np.abs(odometry.angular_radps)])
     way = np.pad(np.cumsum(speed[:, :-1] * np.diff(odometry.stamp_s), axis=1), ((0, 0), (1, 0)))
@@ -261,7 +261,7 @@ def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatA
     return np.asarray(np.any(at - at[:, row] > most, axis=0))
 
 
-def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: list[str]) -> FloatArray:
+def _mend_stamps(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: list[str]) -> FloatArray:
     """Return (N,) stamps of a clock that is never set back, nan for invalid ones."""
     stamps, back_s = restored(stamp_s, settings)
     real = stamps[np.isfinite(stamps)]

@@ -189,7 +189,7 @@ def lasting_errors(residual: FloatArray, weight: FloatArray, stamp_s: FloatArray
         [each for each in PERSIST_S if each <= max(float(np.ptp(stamp_s)) if len(stamp_s) else 0.0, PERSIST_S[0])]
     )
     none = Lasting(persist_s, np.zeros(len(persist_s)))
-    curve = _pooled(residual, weight > LEAST_WEIGHT, stamp_s, place)
+    curve = _pool_differences(residual, weight > LEAST_WEIGHT, stamp_s, place)
     if len(curve.lag_s) < FEWEST_BINS:
         return none
     white, (parts, log_likelihood) = fit_curve(curve, [], 0.0)[1], fit_curve(curve, persist_s.tolist(), 0.0)
@@ -198,7 +198,7 @@ def lasting_errors(residual: FloatArray, weight: FloatArray, stamp_s: FloatArray
     return Lasting(persist_s, parts[1:] / max(float(parts.sum()), 1e-12))
 
 
-def _pooled(residual: FloatArray, used: BoolArray, stamp_s: FloatArray, place: IntArray) -> Curve:
+def _pool_differences(residual: FloatArray, used: BoolArray, stamp_s: FloatArray, place: IntArray) -> Curve:
     """Half of the mean squares of differences, a component, over pairs of residuals of one landmark."""
     rows = np.flatnonzero(used)
     rows = rows[np.argsort(place[rows], kind="stable")]

@@ -17,7 +17,7 @@ import numpy as np
 from evermap.estimate.gauss_newton import Steps
 from evermap.estimate.graph import Border, FactorBlock, Room
 from evermap.estimate.robust import HEAVY_TAIL, weigh
-from evermap.estimate.sparse.system import Factorised, Slices, exhausted
+from evermap.estimate.sparse.system import Factorised, Slices, exhaust
 from evermap.slam.kernels import N_MOTION, N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.problem import Block, Estimate, Marginals
 from evermap.slam.smoother import COST_SLACK, POSES_A_LEAF, Smoother, retract
@@ -174,16 +174,16 @@ class PlanarTogether(Together[Estimate]):
         return self._own[1]
 
     def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
-        """Return the values at which `solved_in_slices` ends.
+        """Return the values at which `solve_in_slices` ends.
 
         Raises:
             NumericalError: no finite optimum.
         """
-        return exhausted(self.minimised_in_slices(start, Steps(iterations, tolerance, 0.0, COST_SLACK))).state
+        return exhaust(self.minimise_in_slices(start, Steps(iterations, tolerance, 0.0, COST_SLACK))).state
 
     def solved(self, start: Estimate, steps: Steps) -> tuple[Estimate, Marginals]:
         """Return the optimum, and the covariances that its last step was made with."""
-        solution = exhausted(self.minimised_in_slices(start, steps))
+        solution = exhaust(self.minimise_in_slices(start, steps))
         return solution.state, self.marginals(solution.state, solution.factorised)
 
     def marginals(self, estimate: Estimate, solved: Factorised | None = None) -> Marginals:
@@ -193,7 +193,7 @@ class PlanarTogether(Together[Estimate]):
         """
         known = estimate.known
         if solved is None:
-            solved = exhausted(self.factorised_in_slices(estimate))
+            solved = exhaust(self.factorise_in_slices(estimate))
         n, places, first = len(estimate.pose), int(known.sum()), self.graph(estimate).structure.first
         block = Block(0, n + np.arange(places), n + places, 0, first[2 * len(self.robots)], n - len(self.robots))
         return Marginals(solved, n, len(self.met.robot), known, block=block)

@@ -68,7 +68,7 @@ def find_from(stamp_s: FloatArray, at_s: float, near: float) -> int:
 
 
 @kernel
-def reckoned_motions(
+def reckon_motions(
     first_s: FloatArray,
     second_s: FloatArray,
     delay_s: float,
@@ -290,12 +290,12 @@ def integrate_odometry(
     jacobian[2, 2] = angle
     jacobian[0, 3], jacobian[1, 3], jacobian[2, 3] = c * slip_x + s * slip_y, -s * slip_x + c * slip_y, 0.0
     seconds = max(end - begin, 0.0)
-    _carried(noise[0], f_xx, f_xy, f_yy, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
-    _carried(noise[1], g_xx, g_xy, g_yy, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
-    _carried(noise[2], f_yy, -f_xy, f_xx, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
-    _carried(noise[3], t_xx, t_xy, t_yy, t_x, t_y, seconds, c, s, lever_x, lever_y)
-    _carried(noise[4], a_xx, a_xy, a_yy, a_x, a_y, a_t, c, s, lever_x, lever_y)
-    _carried(floor, u_xx + even, u_xy, u_yy + even, u_x, u_y, u_t, c, s, lever_x, lever_y)
+    _carry_covariance(noise[0], f_xx, f_xy, f_yy, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
+    _carry_covariance(noise[1], g_xx, g_xy, g_yy, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
+    _carry_covariance(noise[2], f_yy, -f_xy, f_xx, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
+    _carry_covariance(noise[3], t_xx, t_xy, t_yy, t_x, t_y, seconds, c, s, lever_x, lever_y)
+    _carry_covariance(noise[4], a_xx, a_xy, a_yy, a_x, a_y, a_t, c, s, lever_x, lever_y)
+    _carry_covariance(floor, u_xx + even, u_xy, u_yy + even, u_x, u_y, u_t, c, s, lever_x, lever_y)
     for i in range(3):
         for j in range(3):
             floor[i, j] += FLOOR_TURN_RAD * FLOOR_TURN_RAD * noise[3, i, j]
@@ -326,7 +326,7 @@ def _of_turn(turn: float) -> tuple[float, float, float, float]:
 
 
 @kernel
-def _carried(
+def _carry_covariance(
     out: FloatArray, xx: float, xy: float, yy: float, xt: float, yt: float, tt: float, c: float, s: float,
     lever_x: float, lever_y: float,
 ) -> None:  # fmt: skip

@@ -198,7 +198,7 @@ def retract(pose: FloatArray, twist: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def _put(out: FloatArray, x: float, y: float, z: float, a: Quaternion) -> None:
-    """Write a pose as `se3.normalised`."""
+    """Write a pose as `se3.normalise_poses`."""
     first = a[3]
     for k in (2, 1, 0):
         if first == 0.0:

@@ -16,7 +16,7 @@ from evermap.config import LocalizeConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
 from evermap.geometry.group import PLANE, Group
-from evermap.slam.batch import sighted_at
+from evermap.slam.batch import sight_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 LEAST_VARIANCE = 1e-6
@@ -226,7 +226,7 @@ class LocalTrack(DriveTrack[FloatArray]):
 
     def see(self, stamp_s: float, seen: FrameSightings, used: IntArray, states: FloatArray) -> None:
         """Add sightings (M,) of landmarks of the map; forget those that are too old."""
-        at = sighted_at(self._pose, seen.reading[used], states, self._mount)
+        at = sight_at(self._pose, seen.reading[used], states, self._mount)
         self._keep(stamp_s, seen.landmark_id[used].tolist(), list(at))
 
     def placed(self, stamp_s: float, places: KnownPlaces) -> Placed | None:

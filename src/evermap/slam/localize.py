@@ -20,7 +20,7 @@ from evermap.geometry import se2
 from evermap.sensing.visibility import USUAL as FIELD
 from evermap.sensing.visibility import NominalField
 from evermap.show import Shown
-from evermap.slam.batch import sighted_at
+from evermap.slam.batch import sight_at
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import AT_PLACES, N_SENSOR
 from evermap.slam.known_places import FrameSightings, KnownPlaces, LocalTrack, Neighbourhood, Placed
@@ -85,7 +85,7 @@ class BaseLocalizer(Shown, ABC):
         self._log_p = np.log(np.maximum(places.p_here, settings.least_belief))
         self._believed = self._log_p.copy()
         self._stamp_s: float | None = None
-        self._agreed: dict[int, tuple[float, bool]] = {}
+        self._list_agreeing: dict[int, tuple[float, bool]] = {}
         self.learn = learn
         """Whether landmarks that the map lacks are used."""
         self._new: dict[int, int] = {}
@@ -221,7 +221,7 @@ class BaseLocalizer(Shown, ABC):
         agreement, places, by = self._track.agreement, self.places, self._settings.better_by
         if self._is_placed and agreement(placed.pose, places) < by * agreement(self._filter.pose, places):
             self._track = None  # it is the world that differs from the map
-            self._agreed.clear()
+            self._list_agreeing.clear()
             return
         self._place_at(placed)
 
@@ -242,7 +242,7 @@ class BaseLocalizer(Shown, ABC):
         covariance[:pose_dim, :pose_dim] = placed.covariance + follows[:, at] @ placed.by_places.T
         self._believed = self._log_p.copy()
         self._track = None
-        self._agreed.clear()
+        self._list_agreeing.clear()
 
     def _update(
         self, stamp_s: float, first: IntArray, last: IntArray, seen: Any, used: IntArray, new: IntArray
@@ -293,11 +293,11 @@ class BaseLocalizer(Shown, ABC):
         """Lost where most of the landmarks compared last were not where they should have been."""
         settings = self._settings
         for name, good in zip(landmark_id.tolist(), agrees.tolist(), strict=True):
-            self._agreed.pop(name, None)
-            self._agreed[name] = (stamp_s, good)
-        while len(self._agreed) > max(settings.remembered, len(landmark_id)):
-            self._agreed.pop(next(iter(self._agreed)))
-        fresh = [good for seen_s, good in self._agreed.values() if seen_s >= stamp_s - settings.memory_s]
+            self._list_agreeing.pop(name, None)
+            self._list_agreeing[name] = (stamp_s, good)
+        while len(self._list_agreeing) > max(settings.remembered, len(landmark_id)):
+            self._list_agreeing.pop(next(iter(self._list_agreeing)))
+        fresh = [good for seen_s, good in self._list_agreeing.values() if seen_s >= stamp_s - settings.memory_s]
         lost = len(fresh) >= settings.least_remembered and 2 * sum(fresh) < len(fresh)
         if lost and self._track is None:
             self._track = self._begin_track()
@@ -369,7 +369,7 @@ class Localizer(BaseLocalizer):
 
     def _sight(self, row: int, seen: FrameSightings, which: int) -> None:
         local, (_, sigma) = self._local, self._readings(seen, np.array([which]))
-        place, by_pose, by_reading = _placed_by(local.pose, seen.reading[which], local.states, self._mount)
+        place, by_pose, by_reading = _place_by(local.pose, seen.reading[which], local.states, self._mount)
         local.sight(row, place, by_pose, by_reading @ np.diag(sigma[0] ** 2) @ by_reading.T)
 
     def _expect(self, seen_id: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
@@ -390,18 +390,18 @@ STEP = 1e-6
 """Of numerical derivatives."""
 
 
-def _placed_by(
+def _place_by(
     pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(2,) where a reading (2,) points to, its derivatives (2, 14) by pose, in its own frame, and states, and (2, 2) by
     the reading.
     """
-    place = sighted_at(pose, reading, states, mount)
+    place = sight_at(pose, reading, states, mount)
     by_pose, by_reading = np.zeros((2, AT_PLACES)), np.zeros((2, 2))
     for k, step in enumerate(STEP * np.eye(3)):
-        by_pose[:, k] = (sighted_at(se2.retract(pose, step), reading, states, mount) - place) / STEP
+        by_pose[:, k] = (sight_at(se2.retract(pose, step), reading, states, mount) - place) / STEP
     for k, step in enumerate(STEP * np.eye(len(states))[:N_SENSOR]):
-        by_pose[:, 3 + k] = (sighted_at(pose, reading, states + step, mount) - place) / STEP
+        by_pose[:, 3 + k] = (sight_at(pose, reading, states + step, mount) - place) / STEP
     for k, step in enumerate(STEP * np.eye(2)):
-        by_reading[:, k] = (sighted_at(pose, reading + step, states, mount) - place) / STEP
+        by_reading[:, k] = (sight_at(pose, reading + step, states, mount) - place) / STEP
     return place, by_pose, by_reading

@@ -280,7 +280,7 @@ def _result(run: _Run, parameters: tuple[ParameterEstimate, ...], landmarks: Lan
     """Return what the frames said, as plain arrays; without dead reckoning."""
     recording, placed, misses = run.recording, run.placed, run.misses
     pose = np.array([one.pose for one in run.located])[placed]
-    pose = group_of(pose).normalised(pose)
+    pose = group_of(pose).normalise_poses(pose)
     spread = np.array([one.covariance for one in run.located])[placed]
     stamp_s = recording.frames.stamp_s[run.frame[placed]]
     trajectory = Trajectory(stamp_s, pose, spread, frame="prior_map", clock=recording.clock)

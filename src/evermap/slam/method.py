@@ -86,7 +86,7 @@ class Method(Protocol):
         """
         ...
 
-    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+    def unprejudice(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """Return the problem, and values to start from, on which noise levels are learned before the last revisions.
 
         Unchanged for a method without assumptions that distort the solution.

@@ -13,7 +13,7 @@ from math import inf, log
 import numpy as np
 
 from evermap.config import CheckConfig
-from evermap.slam.kernels import reckoned_motions
+from evermap.slam.kernels import reckon_motions
 from evermap.slam.mistakes import DELAYS_S, HONEST, NO_ODOMETRY, UNITS, Finding, Mistake, make_late, make_longer
 from evermap.slam.pairs import Pairs, measure_loss, off, pairs_of, reckon_drive, sighting_pairs
 from evermap.types import AnyRecording, FloatArray, Recording, is_in_space
@@ -161,7 +161,7 @@ def _find_unit_of_ranges(recording: Recording, settings: CheckConfig) -> list[Fi
     stamp_s, motion = recording.frames.stamp_s[seen.frame], np.empty((len(first), 3))
     driven, mount = recording.odometry, np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
     track = reckon_drive(driven, *HONEST.drive)
-    reckoned_motions(stamp_s[first], stamp_s[second], 0.0, driven.stamp_s, track, mount, motion)
+    reckon_motions(stamp_s[first], stamp_s[second], 0.0, driven.stamp_s, track, mount, motion)
     way_m = np.hypot(motion[:, 0], motion[:, 1])
     moved = way_m > LEAST_WAY_M
     faster = np.abs(seen.range_m[second] - seen.range_m[first])[moved] / way_m[moved]

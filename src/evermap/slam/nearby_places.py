@@ -129,7 +129,7 @@ class NearbyPlaces:
         self._used_at[slots[here]] = self._now
         waiting = list(dict.fromkeys(rows[~here].tolist()))
         self._make_room(len(waiting))
-        for row, ties in zip(waiting, self._tied(waiting), strict=True):
+        for row, ties in zip(waiting, self._tie_places(waiting), strict=True):
             self._return(row, ties)
         return self._slot[rows]
 
@@ -233,7 +233,7 @@ class NearbyPlaces:
         at = self.columns(leaving)
         self.covariance[at], self.covariance[:, at] = 0.0, 0.0
 
-    def _tied(self, waiting: list[int]) -> list[Ties]:
+    def _tie_places(self, waiting: list[int]) -> list[Ties]:
         """Return the ties of places to others: as stored, or from the solution or the map if most neighbours left."""
         solved, here = np.isfinite(self._given_position[:, 0]), self._slot >= 0
         of = self.active if self._neighbours else NO_PLACES

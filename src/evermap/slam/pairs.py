@@ -15,7 +15,7 @@ import numpy as np
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.group import accumulate
-from evermap.slam.kernels import pair_residuals, reckoned_motions
+from evermap.slam.kernels import pair_residuals, reckon_motions
 from evermap.slam.mistakes import (
     ANGLES,
     AXES,
@@ -147,7 +147,7 @@ class PlanarPairs:
             if drive not in self._tracks:
                 self._tracks[drive] = reckon_drive(self._odometry, *drive)
             track = self._tracks[drive]
-            reckoned_motions(*self._stamp_s, delay_s, self._odometry.stamp_s, track, self._mount, motion[row])
+            reckon_motions(*self._stamp_s, delay_s, self._odometry.stamp_s, track, self._mount, motion[row])
         undone = np.array([(each.lengths, each.bearing, each.offset_rad) for each in mistakes])
         found = np.empty((len(mistakes), 2, motion.shape[1]))
         pair_residuals(motion, which, undone, *self._readings, found)

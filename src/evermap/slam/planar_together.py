@@ -30,9 +30,9 @@ from evermap.slam.batch import (
     STEPS_A_ROUND,
     Outcome,
     divided,
-    sighted_at,
+    sight_at,
 )
-from evermap.slam.bridge import bridged
+from evermap.slam.bridge import bridge_poses
 from evermap.slam.calibration import SLOPE, needed
 from evermap.slam.encounters import Encounters, PlanarTogether
 from evermap.slam.estimate import Solved
@@ -136,7 +136,7 @@ def _extend(member: Solved, stamp_s: FloatArray) -> tuple[Problem, Estimate]:
     """A robot's problem with poses at more instants, without priors of places, and where it puts everything [m]."""
     outcome, problem = member.outcome, member.outcome.problem
     graph, spread = outcome.graph_estimate, outcome.graph_marginals
-    pose, _ = bridged(
+    pose, _ = bridge_poses(
         stamp_s, problem.stamp_s, graph.pose, spread.pose, spread.consecutive, problem.drive, graph.states,
         outcome.noise.noise,
     )  # fmt: skip
@@ -165,7 +165,7 @@ def _place(members: Sequence[Solved], own: Sequence[tuple[Problem, Estimate]], m
     sighted = np.zeros((len(other), 2))
     for r, (problem, estimate) in enumerate(own):
         mine = met.robot == r
-        sighted[mine] = sighted_at(pose[met.observer[mine]], met.reading[mine], estimate.states, problem.mount)
+        sighted[mine] = sight_at(pose[met.observer[mine]], met.reading[mine], estimate.states, problem.mount)
     names = [member.prepared.landmark_id for member in members]
 
     def in_both(a: int, b: int) -> tuple[FloatArray, FloatArray, IntArray]:

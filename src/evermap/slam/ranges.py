@@ -181,7 +181,7 @@ def locate_by_ranges(ranged: Ranged, noise_m: float, offset_m: float, settings: 
     middle, angle = len(ranged.range_m) // 2, np.linspace(0.0, 2.0 * np.pi, settings.starts, endpoint=False)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     start = ranged.eye[middle] + ranged.range_m[middle] * around
-    at, cost, information = _descended(np.pad(start, ((0, 0), (0, 1))), ranged, sigma, offset_m, settings)
+    at, cost, information = _descend(np.pad(start, ((0, 0), (0, 1))), ranged, sigma, offset_m, settings)
     best = int(np.argmin(cost))
     spread = np.linalg.inv(information[best])[:2, :2]
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
@@ -192,7 +192,7 @@ def locate_by_ranges(ranged: Ranged, noise_m: float, offset_m: float, settings: 
     return Fix(at[best, :2], sigma_m, way_m)
 
 
-def _descended(
+def _descend(
     at: FloatArray, ranged: Ranged, sigma: FloatArray, offset_m: float, settings: RangesConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return positions and offsets (K, 3) after damped Gauss-Newton steps from starts (K, 3), costs (K,), and the

@@ -12,7 +12,7 @@ from evermap.estimate.innovations import find_left_out_nis
 from evermap.estimate.measurement import Tied, frame_of
 from evermap.geometry import se2
 from evermap.slam.batch import Outcome, lay_over
-from evermap.slam.bridge import bridged, dead_reckoned
+from evermap.slam.bridge import bridge_poses, dead_reckoned
 from evermap.slam.calibration import (
     BEARING,
     FORWARD,
@@ -115,7 +115,7 @@ def trajectory(solved: Solved, frame: str) -> Trajectory:
 def poses_at(solved: Solved, stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return smoothed poses (K, 3) at any stamps (K,), and their covariances (K, 3, 3)."""
     outcome = solved.outcome
-    pose, covariance = bridged(
+    pose, covariance = bridge_poses(
         stamps - solved.prepared.start_s,
         outcome.problem.stamp_s,
         outcome.graph_estimate.pose,

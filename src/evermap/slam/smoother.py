@@ -14,7 +14,7 @@ from evermap.estimate.graph import Border, FactorBlock, Graph, GraphStructure, L
 from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.robust import HEAVY_TAIL
 from evermap.estimate.solver import Solver
-from evermap.estimate.sparse.system import Factorised, Slices, System, exhausted
+from evermap.estimate.sparse.system import Factorised, Slices, System, exhaust
 from evermap.estimate.sparse.tree import tree_of
 from evermap.estimate.start import StartFactor
 from evermap.slam.calibration import BEARING, DELAY
@@ -84,14 +84,14 @@ class Smoother(Solver[Estimate]):
         return other
 
     def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
-        """Return the values at which `solved_in_slices` ends.
+        """Return the values at which `solve_in_slices` ends.
 
         Raises:
             NumericalError: no finite optimum.
         """
-        return exhausted(self.solved_in_slices(start, iterations=iterations, tolerance=tolerance))[0]
+        return exhaust(self.solve_in_slices(start, iterations=iterations, tolerance=tolerance))[0]
 
-    def solved_in_slices(
+    def solve_in_slices(
         self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6, settled: float = 0.0
     ) -> Slices[tuple[Estimate, Marginals]]:
         """Run damped Gauss-Newton in slices; return the optimum and the covariances that its last step was made with.
@@ -100,10 +100,10 @@ class Smoother(Solver[Estimate]):
         `settled` nats.
         """
         steps = Steps(iterations, tolerance, settled, COST_SLACK)
-        solution = yield from self.minimised_in_slices(start, steps)
+        solution = yield from self.minimise_in_slices(start, steps)
         estimate, solved = solution.state, solution.factorised
         if solved is None:
-            solved = yield from self.factorised_in_slices(estimate)
+            solved = yield from self.factorise_in_slices(estimate)
         return estimate, self._marginals(estimate, solved)
 
     def inlier_probability(self, estimate: Estimate) -> FloatArray:
@@ -116,11 +116,11 @@ class Smoother(Solver[Estimate]):
         Raises:
             NumericalError: the measurements do not determine a solution.
         """
-        return exhausted(self.marginals_in_slices(estimate))
+        return exhaust(self.marginals_in_slices(estimate))
 
     def marginals_in_slices(self, estimate: Estimate) -> Slices[Marginals]:
         """Return what `marginals` does, in slices."""
-        solved = yield from self.factorised_in_slices(estimate)
+        solved = yield from self.factorise_in_slices(estimate)
         return self._marginals(estimate, solved)
 
     def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
@@ -196,7 +196,7 @@ class Smoother(Solver[Estimate]):
         dim[system.tree.border[0]] += count  # behind the states of the sensor
         wider = System(dim, system.factors, graph.structure.coordinate, system.tree.border)
         values = np.concatenate([now.values[: where.start], seen.ravel(), now.values[where.stop :]])
-        solved = exhausted(wider.factorised(values, extra=np.append(graph.held, np.zeros(count))))
+        solved = exhaust(wider.factorised(values, extra=np.append(graph.held, np.zeros(count))))
         behind = N_SENSOR + np.arange(count)
         order = np.insert(np.arange(N_SENSOR), N_SENSOR, [*(N_SENSOR + count + np.arange(N_MOTION)), *behind])
         return solved.information[np.ix_(order, order)], solved.right[order]
@@ -230,11 +230,11 @@ class Smoother(Solver[Estimate]):
         Returns:
             (n, n) and (n,), n = 3 poses + 2 known landmarks + 11: information and right side of a step from `estimate`.
         """
-        return exhausted(self.information_in_slices(estimate, poses))
+        return exhaust(self.information_in_slices(estimate, poses))
 
     def information_in_slices(self, estimate: Estimate, poses: IntArray) -> Slices[tuple[FloatArray, FloatArray]]:
         """Return what `information` does, in slices."""
-        now, graph = (yield from self.linearised_in_slices(estimate)), (yield from self.graph_in_slices(estimate))
+        now, graph = (yield from self.linearise_in_slices(estimate)), (yield from self.graph_in_slices(estimate))
         structure, tree, n = graph.structure, graph.structure.system.tree, len(estimate.pose)
         kept = np.concatenate([poses, np.arange(n, len(tree.dim))])
         ordered = yield from tree_of(tree.dim, structure.system.factors, structure.coordinate, kept)

@@ -28,7 +28,7 @@ from evermap.slam.batch import (
     SolvedPart,
     entered,
     lay_over,
-    sighted_at,
+    sight_at,
     voted,
 )
 from evermap.slam.calibration import CalibrationPrior
@@ -96,7 +96,7 @@ class StreamingSlam:
         self._relinearised_at = 0
         self._align_tried = 0
         self._scale = 1.0
-        self._aligned = False
+        self._align_classes = False
         self.online_pose = np.full((len(problem.stamp_s), 3), np.nan)
         """(N, 3) causal poses, as soon as each frame was processed."""
         self.online_covariance = np.full((len(problem.stamp_s), 3, 3), np.nan)
@@ -124,14 +124,14 @@ class StreamingSlam:
         self._owed_ms = self._a_frame_ms()
         if not later:
             self.work()
-        if self._prior_map is not None and not self._aligned:
+        if self._prior_map is not None and not self._align_classes:
             self._lay_over_map()
         self.online_pose[row], self.online_covariance[row] = self._told(self._filter.pose, self._filter.covariance)
 
     def _told(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A pose and its covariance in metres, of the robot's front, in the frame of the first one or of the map."""
         front = self._prior.front(self._filter.states, self._problem.mount)
-        return told(pose, covariance, front, self._scale, self._aligned)
+        return told(pose, covariance, front, self._scale, self._align_classes)
 
     @property
     def states(self) -> FloatArray:
@@ -148,7 +148,7 @@ class StreamingSlam:
     def places(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return (k, 2) where landmarks of the newest pose are, in the frame of `online_pose`, and (k, 2, 2)."""
         front = self._prior.front(self._filter.states, self._problem.mount)
-        back = np.zeros(3) if self._aligned else se2.inverse(front)
+        back = np.zeros(3) if self._align_classes else se2.inverse(front)
         turn = se2.rotation(float(back[2]))
         covariance = turn @ self._filter.spread(rows) @ turn.T
         return se2.transform(back, self._filter.position[rows]) * self._scale, covariance * self._scale**2
@@ -175,12 +175,12 @@ class StreamingSlam:
         since = self._n_poses - self._relinearised_at
         share = LONGEST_SPELL if self._n_poses < SETTLED_AT else SETTLED_SPELL
         if self._n_poses == self._next_relinearisation:
-            self._job = self._relinearised(learn=True)
+            self._job = self._relinearise(learn=True)
             self._next_relinearisation *= 2
         elif self._disputed and self._job is None:
-            self._job, self._disputed = self._relinearised(learn=True), False
+            self._job, self._disputed = self._relinearise(learn=True), False
         elif self._job is None and since >= max(SHORTEST_SPELL, int(share * self._relinearised_at)):
-            self._job = self._relinearised(learn=False)
+            self._job = self._relinearise(learn=False)
 
     def _a_frame_ms(self) -> float:
         """Work on a relinearisation in a frame: a few slices; all if not paced, or if no place may change meanwhile."""
@@ -202,24 +202,24 @@ class StreamingSlam:
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
         self.work()
-        if self._prior_map is not None and not self._aligned:
+        if self._prior_map is not None and not self._align_classes:
             self._lay_over_map(final=True)
         self._job = None
         problem, estimate = self._problem.until(self._n_poses), self._filter.estimate()
         batch = Batch(self._prior, self._start_noise, self._method, self._settings)
-        if self._framed and not self._aligned:
+        if self._framed and not self._align_classes:
             return batch.solved(SolvedPart(problem, estimate, self._noise, fits=True), None, self._framed)
-        return batch.finished(problem, estimate, self._noise, aligned=self._aligned)
+        return batch.finished(problem, estimate, self._noise, aligned=self._align_classes)
 
     def _assign(self, row: int, detections: IntArray) -> None:
         """Ask the method for the places of the coming pose's detections."""
-        problem = self._assigned(self._problem, self._method, self._filter, self._landmark, row, detections)
+        problem = self._assign_places(self._problem, self._method, self._filter, self._landmark, row, detections)
         if problem is not self._problem:
             self._adopt(problem, grown(self._landmark, len(problem.landmark_mean)))
             self._filter.problem = self._problem
 
     @staticmethod
-    def _assigned(
+    def _assign_places(
         problem: Problem, method: Method, running: SessionFilter, landmark: FloatArray, row: int, detections: IntArray
     ) -> Problem:
         """Return the problem with the places that a method has for the detections of the pose after a filter's."""
@@ -281,9 +281,9 @@ class StreamingSlam:
                 landmark[j] = prior.place(landmark, problem.landmark_mean)
             else:
                 reading, mount = problem.reading[m], problem.mount
-                landmark[j] = sighted_at(running.pose, reading, running.states, mount)
+                landmark[j] = sight_at(running.pose, reading, running.states, mount)
 
-    def _relinearised(self, *, learn: bool) -> Slices[None]:
+    def _relinearise(self, *, learn: bool) -> Slices[None]:
         """Relinearise all poses so far in parallel to the stream, catch up with it, and take over.
 
         With `learn`, also vote on places, ask the method, and learn the noise.
@@ -294,7 +294,7 @@ class StreamingSlam:
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
             estimate = yield from voted(smoother, estimate, self._settings.fewest_sightings)
-        estimate, marginals = yield from smoother.solved_in_slices(
+        estimate, marginals = yield from smoother.solve_in_slices(
             estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE if learn else NEAR
         )
         if learn and method.revises(problem):
@@ -320,7 +320,7 @@ class StreamingSlam:
         marginals = yield from smoother.marginals_in_slices(estimate)
         if learn:
             unknown = np.zeros((N_STATES, N_STATES))
-            self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, unknown)[2]
+            self._scale = 1.0 if self._align_classes else self._prior.split_scale(estimate.states, unknown)[2]
         following = SessionFilter(self._problem if revised is None else revised, self._noise, robust=self._robust)
         following.restart(estimate, self._noise, following.problem, marginals)
         yield 1.0
@@ -333,7 +333,7 @@ class StreamingSlam:
             detections = following.problem.detections_of(row)
             following.drive(following.motion(row))
             if revised is not None:
-                revised = self._assigned(revised, method, following, landmark, row, detections)
+                revised = self._assign_places(revised, method, following, landmark, row, detections)
                 following.problem, landmark = revised, grown(landmark, len(revised.landmark_mean))
             self._meet_new_landmarks(following, landmark, detections)
             following.add(row, landmark)
@@ -360,11 +360,11 @@ class StreamingSlam:
         """Move the estimate from the first pose's frame into the prior map's, then constrain it by the map."""
         assert self._prior_map is not None
         self._problem, moved = entered(self._problem, estimate, self._prior_map, self._prior, pose_map_world)
-        self._aligned, self._scale = True, 1.0
+        self._align_classes, self._scale = True, 1.0
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
         self._landmark = moved.landmark.copy()
         self._filter.restart(moved, self._noise, self._problem)
-        self._job = self._relinearised(learn=True)
+        self._job = self._relinearise(learn=True)
         self._owed_ms = self._a_frame_ms()
         self.work()

@@ -32,7 +32,7 @@ from evermap.estimate.graph import (
     concatenate_groups,
 )
 from evermap.estimate.solver import Solver
-from evermap.estimate.sparse.system import Slices, exhausted
+from evermap.estimate.sparse.system import Slices, exhaust
 from evermap.slam.smoother import HELD
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -171,7 +171,7 @@ def settle(
         NumericalError: no finite optimum.
     """
     for round_, rules in enumerate(steps):
-        solution = exhausted(joint.minimised_in_slices(state, rules))
+        solution = exhaust(joint.minimise_in_slices(state, rules))
         state = solution.state
         joint, is_settled = learn(joint, solution, round_)
         if is_settled:

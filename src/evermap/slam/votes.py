@@ -19,7 +19,7 @@ from evermap.config import SlamConfig, VotesConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
-from evermap.slam.batch import sighted_at
+from evermap.slam.batch import sight_at
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.intake import prepare
 from evermap.slam.kernels import kernel
@@ -120,7 +120,7 @@ def _in_plane(recording: Recording, settings: SlamConfig) -> tuple[IntArray, Rea
     prepared = prepare(recording, settings=settings.odometry)
     problem = prepared.problem
     pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
-    at = sighted_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
+    at = sight_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
     variance = (settings.votes.sigma_m + settings.votes.sigma_share * problem.reading[:, 0]) ** 2
     return prepared.used, Read(at, variance, problem.seen_s, problem.pose_row, problem.landmark_row)
 
@@ -235,7 +235,7 @@ def _learn_variance(read: Read, settings: VotesConfig) -> FloatArray:
 
 
 @kernel
-def _squared(at: FloatArray, variance: FloatArray, j: int, k: int) -> float:
+def _find_squared(at: FloatArray, variance: FloatArray, j: int, k: int) -> float:
     """Normalised squared distance of two detections."""
     squared = 0.0
     for axis in range(at.shape[1]):
@@ -250,7 +250,7 @@ def _apart(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray)
     for k in range(len(at)):
         for j in range(near[k, 1] - 1, k, -1):
             if name[j] == name[k]:
-                found[k] = _squared(at, variance, j, k)
+                found[k] = _find_squared(at, variance, j, k)
                 break
     return found
 
@@ -271,7 +271,7 @@ def _votes(
         for j in range(near[k, 0], near[k, 1]):
             if (at[j, 0] - at[k, 0]) ** 2 >= 4.0 * gate * gate * (variance[j] + variance[k]):  # most are
                 continue
-            squared = _squared(at, variance, j, k)
+            squared = _find_squared(at, variance, j, k)
             if not squared < 4.0 * gate * gate:
                 continue
             if name[j] == name[k]:
@@ -298,6 +298,6 @@ def _doubles(
         j = k + 1
         while j < len(at) and stamp_s[j] == stamp_s[k]:
             if name[j] == name[k] and sure[j] and sure[k]:
-                count[name[k]] += _squared(at, variance, j, k) > 4.0 * gate * gate
+                count[name[k]] += _find_squared(at, variance, j, k) > 4.0 * gate * gate
             j += 1
     return count

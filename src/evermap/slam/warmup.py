@@ -16,10 +16,10 @@ from evermap.estimate.sparse.elimination import (
     multiply_transposed,
     ways_to_border,
 )
-from evermap.estimate.sparse.system import System, exhausted
+from evermap.estimate.sparse.system import System, exhaust
 from evermap.estimate.sparse.tree import Factors
 from evermap.sensing.visibility import NominalField
-from evermap.slam.bridge import bridged, dead_reckoned
+from evermap.slam.bridge import bridge_poses, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.search import find_changes
@@ -49,7 +49,7 @@ def warm_up(*, search: bool = True) -> None:
     """
     filtered()
     if search:
-        searched()
+        search_changes()
     smoothed()
 
 
@@ -63,7 +63,7 @@ def filtered() -> None:
     any_filter()
     stamps = problem.stamp_s[:2]
     covariance, cross = np.tile(np.eye(3), (2, 1, 1)), np.zeros((1, 3, 3))
-    bridged(stamps, stamps, np.zeros((2, 3)), covariance, cross, problem.drive, problem.prior.mean, START)
+    bridge_poses(stamps, stamps, np.zeros((2, 3)), covariance, cross, problem.drive, problem.prior.mean, START)
     dead_reckoned(stamps, problem.drive, problem.prior.mean, START)
     NominalField(Sensor(range_max_m=5.0)).p_detect(np.zeros((1, 3)), np.array([PLACE]))
 
@@ -82,12 +82,12 @@ def any_filter() -> None:
 
 
 @functools.cache
-def searched() -> None:
+def search_changes() -> None:
     """Compile the search for changes: three landmarks at their places."""
     place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3
     evidence = WindowEvidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
     comparison = compare(evidence, place, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, dtype=np.bool_))
-    exhausted(find_changes(evidence, comparison, place, 1, ChangesConfig()))
+    exhaust(find_changes(evidence, comparison, place, 1, ChangesConfig()))
 
 
 @functools.cache
@@ -97,7 +97,7 @@ def smoothed() -> None:
     smoother = Smoother(problem, START)
     pose = np.pad(FORWARD_MPS * problem.stamp_s[:, None], ((0, 0), (0, 2)))
     start = Estimate(pose, np.array([PLACE]), problem.prior.mean)
-    estimate, marginals = exhausted(smoother.solved_in_slices(start, iterations=1))
+    estimate, marginals = exhaust(smoother.solve_in_slices(start, iterations=1))
     refine_noise(problem, estimate, marginals, smoother.inlier_probability(estimate), START)
     smoother.worth(estimate, marginals)
     problem.new_information(Lasting(np.ones(1), np.ones(1)))

@@ -86,10 +86,10 @@ class ClassPosterior(Shown):
         fine = _fine(log_likelihood) + said
         weight, _ = _classes(fine, improper)
         weight[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
-        return cls._normalised(weight, improper)
+        return cls._normalise_weights(weight, improper)
 
     @classmethod
-    def _normalised(cls, weight: FloatArray, improper: bool) -> Self:
+    def _normalise_weights(cls, weight: FloatArray, improper: bool) -> Self:
         weight = weight / weight.sum(axis=(1, 2), keepdims=True)
         return cls(weight, np.exp(finer(LOG_MEAN)), _second(improper), improper)
 
@@ -192,7 +192,7 @@ class SitesPosterior(Shown):
         of_site = np.sum(list(of_pairs), axis=0)
         if fine is not None:
             of_site[:-1] *= np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
-        return ClassPosterior._normalised(of_site, self.improper)
+        return ClassPosterior._normalise_weights(of_site, self.improper)
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,14 +226,14 @@ class Gamma(_OfPositives, SmoothLifetime):
         above = gammaincc(self.shape, x)
         far = self._is_far(x)
         log_hazard = np.asarray(xlogy(self.shape - 1.0, x) - x - gammaln(self.shape) - np.log(above))
-        log_hazard[far] = -np.log(x[far] * self._continued_fraction(x[far]))
+        log_hazard[far] = -np.log(x[far] * self._find_gamma_tail(x[far]))
         return log_hazard - math.log(self.scale_s)
 
     def _is_far(self, x: FloatArray) -> FloatArray:
         """Return where the continued fraction converges in a few dozen steps."""
         return np.asarray(x > self.shape + 10.0 + 3.0 * math.sqrt(self.shape))
 
-    def _continued_fraction(self, x: FloatArray) -> FloatArray:
+    def _find_gamma_tail(self, x: FloatArray) -> FloatArray:
         """Return `Gamma(shape, x) exp(x) x^-shape` (Legendre's continued fraction, DLMF 8.9.2), from its tail back."""
         x = np.where(self._is_far(x), x, self.shape + 10.0 + 3.0 * math.sqrt(self.shape))
         value = np.zeros_like(x)
@@ -242,7 +242,7 @@ class Gamma(_OfPositives, SmoothLifetime):
         return np.asarray(1.0 / (x + 1.0 - self.shape + value))
 
     def _log_upper_tail(self, x: FloatArray) -> FloatArray:
-        return np.asarray(self.shape * np.log(x) - x - math.lgamma(self.shape) + np.log(self._continued_fraction(x)))
+        return np.asarray(self.shape * np.log(x) - x - math.lgamma(self.shape) + np.log(self._find_gamma_tail(x)))
 
     def _log_lower_series(self, x: FloatArray) -> FloatArray:
         """Return `log P(shape, x)` where it underflows, so `x` is far below `shape` or tiny (DLMF 8.7.1)."""
@@ -317,7 +317,7 @@ class GeneralPurpose(SmoothLifetime):
         return math.log1p((self.high - self.low) / self.low)
 
     def _log_cumulative(self, t: FloatArray) -> FloatArray:
-        died = self._died(t)
+        died = self._find_p_died(t)
         late = self.low * t - (np.log(self._d(t)) - math.log(self._span))
         return np.where(died < 0.5, np.log(-np.log1p(-np.minimum(died, 0.5))), np.log(late))
 
@@ -329,7 +329,7 @@ class GeneralPurpose(SmoothLifetime):
     def _is_smooth(self, t: FloatArray) -> BoolArray:
         return np.asarray(((self.high - self.low) * t < 2.0) & (self._span < _NARROW))
 
-    def _died(self, t: FloatArray) -> FloatArray:
+    def _find_p_died(self, t: FloatArray) -> FloatArray:
         """Return `1 - S(t)`."""
         wide = np.asarray(entire_exponential_integral(self.high * t) - entire_exponential_integral(self.low * t))
         wide /= self._span
@@ -343,7 +343,7 @@ class GeneralPurpose(SmoothLifetime):
         value = np.asarray(scaled_e1(self.low * t) - np.exp(-(self.high - self.low) * t) * scaled_e1(self.high * t))
         early = self.high * t < 1.0
         if early.any():
-            value[early] = np.exp(self.low * t[early]) * self._span * (1.0 - self._died(t[early]))
+            value[early] = np.exp(self.low * t[early]) * self._span * (1.0 - self._find_p_died(t[early]))
         smooth = self._is_smooth(t)
         if smooth.any():
             value[smooth] = self._span * self._mean_over_rates(

@@ -198,7 +198,7 @@ def fit(kind: str | Kind, data: CensoredLifetimes) -> ParametricFit:
         DataError: no lifetime has an end.
         NumericalError: the likelihood has no clear maximum in this family.
     """
-    data = _counted(data)
+    data = _keep_counted(data)
 
     def of_samples(prior: LifetimePrior) -> float:
         return float(data.weight @ log_likelihood(prior, data))
@@ -272,7 +272,7 @@ def _named(kind: str | Kind) -> tuple[str, Kind]:
     return kind, KINDS[kind]
 
 
-def _counted(data: CensoredLifetimes) -> CensoredLifetimes:
+def _keep_counted(data: CensoredLifetimes) -> CensoredLifetimes:
     """Return the rows of positive weight."""
     rows = data.weight > 0.0
     if not np.isfinite(data.right_s[rows]).any():

@@ -143,7 +143,7 @@ class StayLikelihood:
             score = score + self.pairs[:, None] * value
             first += self.pairs[:, None] * each * d1
             second += self.pairs[:, None] * each**2 * d2
-        value, of_end, of_end_2 = _gone(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
+        value, of_end, of_end_2 = _find_gone(left, stays.back[:, None], (stays.back_rate * self.left_s)[:, None])
         score = score + np.where(ended[:, None], value, 0.0)
         of_end, of_end_2 = (np.where(ended[:, None], d, 0.0) for d in (of_end, of_end_2))
         seen, there = log_sum_exp(score), log_sum_exp(-until)
@@ -216,7 +216,7 @@ def _log_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> FloatArr
         return np.log(leave / change) + np.log(-np.expm1(-change))
 
 
-def _gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _find_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return `_log_gone`, and its derivatives by the integrated hazard."""
     value = _log_gone(leave, back, come)
     leave = np.maximum(leave, TINY)

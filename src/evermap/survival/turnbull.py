@@ -280,10 +280,10 @@ def newton_step(point: Point) -> Point:
         step, _ = _proposal(point, point.hazard_curvature(), by_mass * point.above, hazards=True)
         new = _along(point, step)
         return rough_step(point) if new is point else new
-    return new if factor is None or not new.mass.all() else _refined(new, factor)
+    return new if factor is None or not new.mass.all() else _take_more_steps(new, factor)
 
 
-def _refined(point: Point, factor: FloatArray) -> Point:
+def _take_more_steps(point: Point, factor: FloatArray) -> Point:
     """Take further steps with the factorised Hessian of a point close by, which cost a fifth, while they pay off."""
     from scipy.linalg import lapack
 
@@ -336,7 +336,7 @@ def _proposal(
     kept = np.ones(point.mass.size, dtype=bool)
     few, pull, shift, node = matrix, force, np.zeros(force.size), np.arange(force.size)
     for _ in range(ROUNDS):
-        move, factor = _solved(few, pull, tolerance)
+        move, factor = _solve_steps(few, pull, tolerance)
         if move is None:
             return None, None
         change = shift + move[node]
@@ -356,7 +356,7 @@ def _proposal(
     return None, None
 
 
-def _solved(matrix: Terms, force: FloatArray, tolerance: float) -> tuple[FloatArray | None, FloatArray | None]:
+def _solve_steps(matrix: Terms, force: FloatArray, tolerance: float) -> tuple[FloatArray | None, FloatArray | None]:
     """Solve for the movement of the nodes (m + 1,), both ends fixed; None if the matrix is not positive definite.
 
     Returns also the matrix as LAPACK's `pbtrf` factorises it, if that was used.

@@ -98,7 +98,7 @@ LOG_TWO_PI = math.log(2.0 * math.pi)
 
 
 @inlined
-def blurred(a: FloatArray, noise: FloatArray, wide: float) -> Symmetric:
+def blur(a: FloatArray, noise: FloatArray, wide: float) -> Symmetric:
     """Return the covariance of an innovation if a box is misplaced."""
     return (
         a[0, 0] + wide * noise[0, 0], a[0, 1] + wide * noise[0, 1], a[0, 2] + wide * noise[0, 2],
@@ -113,7 +113,7 @@ def is_misplaced(
     """Return whether a box is rather misplaced than where its noise would have it."""
     offset = position[0] - mean[0], position[1] - mean[1], position[2] - mean[2]
     near, det = distance_and_log_det(offset, sum_of(covariance, noise))
-    far, wide_det = distance_and_log_det(offset, blurred(covariance, noise, likelihood.misplaced))
+    far, wide_det = distance_and_log_det(offset, blur(covariance, noise, likelihood.misplaced))
     return -0.5 * (near + det) < likelihood.log_p_misplaced - 0.5 * (far + wide_det)
 
 
@@ -211,7 +211,7 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
                 squared, log_det = distance_and_log_det((dx, dy, dz), sum_of(covariance[i], noise[r]))
                 log_density = -0.5 * (squared + log_det + 3.0 * LOG_TWO_PI) if squared <= likelihood.gate else -math.inf
                 if boxes:
-                    far, wide_det = distance_and_log_det((dx, dy, dz), blurred(covariance[i], noise[r], wide))
+                    far, wide_det = distance_and_log_det((dx, dy, dz), blur(covariance[i], noise[r], wide))
                     if far <= likelihood.gate:
                         beside = likelihood.log_p_misplaced - 0.5 * (far + wide_det + 3.0 * LOG_TWO_PI)
                         log_density = max(log_density, beside)

@@ -270,4 +270,4 @@ def read_poses(path: Path) -> Poses:
     if again.size:
         problem = f"a second pose at {stamp_s[order[again[0]]]:g} s"
         raise table.error(problem, row=int(order[again[0] + 1]), field=STAMP_S.name)
-    return Poses(stamp_s[order], se3.normalised(pose[order]), path)
+    return Poses(stamp_s[order], se3.normalise_poses(pose[order]), path)

@@ -134,7 +134,7 @@ class Recorder:
         confirmed = np.isin(ids, np.unique(ids[columns["state"] != TrackState.BIRTH]))
         order = np.lexsort((frame, ids))
         order = order[confirmed[order]]
-        keep = order[~_given_up_after(ids[order], frame[order], columns["n_missed"][order], len(self._frames))]
+        keep = order[~_find_given_up(ids[order], frame[order], columns["n_missed"][order], len(self._frames))]
         return self._of(keep, frame, columns)
 
     def at_once(self, least_p: float) -> Tracks:
@@ -156,7 +156,7 @@ class Recorder:
         return Tracks(stamp_s=stamps[frame[keep]], **{n: c[keep] for n, c in columns.items() if n != "n_missed"})
 
 
-def _given_up_after(ids: IntArray, frame: IntArray, n_missed: IntArray, n_frames: int) -> BoolArray:
+def _find_given_up(ids: IntArray, frame: IntArray, n_missed: IntArray, n_frames: int) -> BoolArray:
     """(R,) rows without a detection at the end of a stretch of frames, unless the recording ends there too."""
     guess = np.zeros(len(ids), dtype=np.bool_)
     if not len(ids):

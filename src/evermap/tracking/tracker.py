@@ -465,7 +465,7 @@ class Tracker(Shown):
         for kind, row in zip(table.kind[:n_events].tolist(), table.row[:n_events].tolist(), strict=True):
             events.append(Event(frame.stamp_s, EventKind(kind), int(t.track_id[row])))
             if kind == EventKind.BORN:
-                self._bound_arrival(row)
+                self._limit_arrival(row)
         self._spells.add(self._spell_table, n_spells)
         if n_gone:
             leaving = np.flatnonzero(t.state[:n] == WORKING_SET)
@@ -544,9 +544,9 @@ class Tracker(Shown):
             return
         for row in (first + np.flatnonzero(self._tracklets.state[first : self._n] == ALIVE)).tolist():
             events.append(Event(frame.stamp_s, EventKind.BORN, int(self._tracklets.track_id[row])))
-            self._bound_arrival(row)
+            self._limit_arrival(row)
 
-    def _bound_arrival(self, row: int) -> None:
+    def _limit_arrival(self, row: int) -> None:
         """Note when the place of a tracklet that is confirmed was last seen empty."""
         t = self._tracklets
         if np.isneginf(t.elsewhere_s[row]):

@@ -53,7 +53,7 @@ class Recording(Shown, Generic[OdometryT_co, DetectionsT_co]):
         measurements: of other kinds, each kind once.
         sensors: of a recording in space, at least one.
         symmetries: turns after which objects look the same, by the names of their classes; as
-            `geometry.symmetry.Symmetry.generated` reads them.
+            `geometry.symmetry.Symmetry.generate_group` reads them.
     """
 
     name: str

@@ -56,7 +56,7 @@ def what(change: MapChange) -> str:
         return f"{_group(change)} vanished"
     if change.kind is ChangeKind.REPLACED:
         half, beside = len(change.labels) // 2, math.hypot(*change.displacement_m)
-        left, came = (_listed(names) for names in (change.labels[:half], change.labels[half:]))
+        left, came = (_join_labels(names) for names in (change.labels[:half], change.labels[half:]))
         return f"{came} stands {beside:.2f} m from where {left} stood, which was replaced or is the same"
     if change.kind is ChangeKind.APPEARED:
         return f"{_group(change)} appeared"
@@ -75,10 +75,10 @@ def _motion(change: MapChange) -> str:
     turn, shift_m = math.degrees(change.rotation_rad), math.hypot(*change.displacement_m)
     sigma_m = change.displacement_sigma_m
     known = "" if math.isnan(sigma_m) else f" +- {sigma_m:.2f}"
-    moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}){known} m"
+    moved = f"moved by ({', '.join(map(_format_signed, change.displacement_m))}){known} m"
     far = abs(change.rotation_rad) >= SAME_TURN_RAD
     nowhere = all(round(metres, 2) == 0.0 for metres in change.displacement_m)
-    sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
+    sign = _format_signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
     if round(turn, 1) and (nowhere or (far and shift_m < SAME_SPOT_M)):
         return f"turned by {sign}° in place"
     return f"turned by {sign}° and {moved}" if far or change.kind is ChangeKind.ROTATED else moved
@@ -96,14 +96,16 @@ def grew(count: int | None, labels: Sequence[str] = ()) -> list[str]:
     """
     if not count:
         return []
-    return [f"the map grew by {count} landmark{'s' if count != 1 else ''}" + (f": {_listed(labels)}" if labels else "")]
+    return [
+        f"the map grew by {count} landmark{'s' if count != 1 else ''}" + (f": {_join_labels(labels)}" if labels else "")
+    ]
 
 
 def _group(change: MapChange) -> str:
-    return f"landmark{'s' if len(change.labels) != 1 else ''} {_listed(change.labels)}"
+    return f"landmark{'s' if len(change.labels) != 1 else ''} {_join_labels(change.labels)}"
 
 
-def _listed(labels: Sequence[str]) -> str:
+def _join_labels(labels: Sequence[str]) -> str:
     return ", ".join(labels[:_MAX_IDS]) + (f" and {len(labels) - _MAX_IDS} more" if len(labels) > _MAX_IDS else "")
 
 
@@ -118,7 +120,7 @@ def _when(change: MapChange, start_s: float) -> str:
     return f"between {early:.0f} s and {late:.0f} s after the start"
 
 
-def _signed(value: float, digits: int = 2) -> str:
+def _format_signed(value: float, digits: int = 2) -> str:
     """'+1.00', '-0.50', and '0.00' without a sign."""
     rounded = round(value, digits)
     return f"{rounded:+.{digits}f}" if rounded else f"{0.0:.{digits}f}"

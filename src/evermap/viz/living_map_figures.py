@@ -18,9 +18,9 @@ from evermap.viz.panels import (
     draw_footprints,
     draw_shapes,
     height_over_width,
+    is_outlined,
     lay_out,
     mostly_boxes,
-    outlined,
     seen,
 )
 from evermap.viz.style import (
@@ -83,7 +83,7 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
         InputError: there is nothing to draw.
     """
     up = view.landmarks.up
-    view = _levelled(view)
+    view = _level_view(view)
     landmarks = view.landmarks
     if not len(landmarks):
         raise InputError("nothing to draw: the map has no landmark")
@@ -105,7 +105,7 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
     return figure
 
 
-def _levelled(view: MapView) -> MapView:
+def _level_view(view: MapView) -> MapView:
     """A view turned so that up is z; cells of the map's own x and y are then left out."""
     pose = level_pose(view.landmarks.up)
     if view.landmarks.position_m.shape[1] == 2 or not pose[:6].any():
@@ -152,7 +152,7 @@ def _draw_landmarks(axes: Axes, columns: View, view: MapView, reach_m: float) ->
     for name in sorted(set(names)):
         look, label = looks[name], legend_name(name) or "class unknown"
         mine = np.array([other == name for other in names])
-        here = np.flatnonzero(mine & there & ~outlined(view.landmarks, reach_m))
+        here = np.flatnonzero(mine & there & ~is_outlined(view.landmarks, reach_m))
         alpha: Any = _FAINTEST + (1.0 - _FAINTEST) * (landmarks.p_exists[here] - _EXISTS) / (1.0 - _EXISTS)
         x, y = landmarks.position_m[here].T
         if len(here):

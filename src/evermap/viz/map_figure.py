@@ -22,9 +22,9 @@ from evermap.viz.panels import (
     draw_footprints,
     draw_shapes,
     height_over_width,
+    is_outlined,
     lay_out,
     mostly_boxes,
-    outlined,
     seen,
     with_breaks,
 )
@@ -204,7 +204,7 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
     for name in sorted(set(names)):
         look, mine = looks[name], [k for k, other in enumerate(names) if other == name]
         label = legend_name(name) or ("mapped landmark" if set(names) == {""} else "class unknown")
-        at = np.where(outlined(scene.landmarks, reach_m)[mine, None], np.nan, landmarks.position_m[mine])
+        at = np.where(is_outlined(scene.landmarks, reach_m)[mine, None], np.nan, landmarks.position_m[mine])
         axes.plot(*at.T, look.marker, color=look.colour, ms=4.5, mec=PAPER, mew=0.4, label=label, zorder=6)
     _draw_ways(axes, view, scene, 0.02 * reach_m)
     if len(landmarks) == 0:

@@ -156,7 +156,7 @@ def mostly_boxes(landmarks: Landmarks) -> bool:
     return 2 * int(np.count_nonzero(boxes(landmarks))) > len(landmarks)
 
 
-def outlined(landmarks: Landmarks, reach_m: float) -> BoolArray:
+def is_outlined(landmarks: Landmarks, reach_m: float) -> BoolArray:
     """Return (L,) which landmarks of a street are large enough in the picture to be told by their outlines."""
     return np.asarray(mostly_boxes(landmarks) & (box_sizes(landmarks)[:, 0] > _TINY * reach_m))
 

@@ -69,7 +69,7 @@ _PLATE_M = (0.16, 0.16, 0.004)
 Float32Array = NDArray[np.float32]
 
 
-def _opened(recording_id: str, path: str | Path | None, blueprint: Any = None) -> tuple[Any, Any]:
+def _open_recording(recording_id: str, path: str | Path | None, blueprint: Any = None) -> tuple[Any, Any]:
     """Return rerun, and a recording in a file, or in the viewer without a path.
 
     Raises:
@@ -87,7 +87,7 @@ def _opened(recording_id: str, path: str | Path | None, blueprint: Any = None) -
     return rr, stream
 
 
-def _closed_panels(timeline: str) -> list[Any]:
+def _close_panels(timeline: str) -> list[Any]:
     import rerun.blueprint as rrb
 
     time = rrb.TimePanel(timeline=timeline, state="collapsed")
@@ -132,7 +132,7 @@ class _RunScene:
     def write(self, path: Path) -> None:
         """Write all of it; errors as of `write_scene`."""
         require_rerun()
-        self._rr, self._stream = _opened(self._recording.name or "run", path, self._blueprint())
+        self._rr, self._stream = _open_recording(self._recording.name or "run", path, self._blueprint())
         self._stream.send_recording_name(self._recording.name)
         self._send_truth()
         self._send_odometry()
@@ -176,7 +176,7 @@ class _RunScene:
             shown = {"error": "error against truth [m]", "turn": "orientation error [deg]", **shown}
         plots = [rrb.TimeSeriesView(name=title, origin=origin, axis_x=whole) for origin, title in shown.items()]
         views = rrb.Horizontal(scene, rrb.Vertical(*plots), column_shares=[5, 3])
-        return rrb.Blueprint(views, *_closed_panels(TIMELINE))
+        return rrb.Blueprint(views, *_close_panels(TIMELINE))
 
     def _times(self, stamp_s: FloatArray) -> list[Any]:
         return [self._rr.TimeColumn(TIMELINE, **{_kind(self._recording.clock): stamp_s})]
@@ -440,7 +440,7 @@ class LiveScene:
 
     def __init__(self, path: str | Path | None = None) -> None:
         self._before = np.zeros((0, 3))
-        self._rr, self._stream = _opened("live", path)
+        self._rr, self._stream = _open_recording("live", path)
         arrow = self._rr.Arrows3D(
             vectors=[[0.4, 0.0, 0.0]], origins=[[0.0, 0.0, 0.1]], colors=rgb(ESTIMATE), radii=0.05
         )
@@ -520,7 +520,7 @@ def log_tracks(
     """
     require_rerun()
     path = Path(path)
-    rr, stream = _opened(path.stem, path, _tracks_blueprint())
+    rr, stream = _open_recording(path.stem, path, _tracks_blueprint())
     times = [rr.TimeColumn(TRACKS_TIMELINE, duration=stamp_s)]
     colours = [np.where(rest[:, None], rgb(STATIC), rgb(DYNAMIC)).astype(np.uint8) for rest in static]
     labels = [str(one) for ids in track_id for one in ids.tolist()]
@@ -558,4 +558,4 @@ def _tracks_blueprint() -> Any:
     import rerun.blueprint as rrb
 
     views = (rrb.Spatial3DView(name="world", origin="world"), rrb.TimeSeriesView(name="objects", origin="count"))
-    return rrb.Blueprint(rrb.Vertical(*views, row_shares=[4, 1]), *_closed_panels(TRACKS_TIMELINE))
+    return rrb.Blueprint(rrb.Vertical(*views, row_shares=[4, 1]), *_close_panels(TRACKS_TIMELINE))

@@ -247,7 +247,7 @@ def _declutter(axes: Axes, labels: Sequence[Any]) -> None:
         middle = point + way * (ring[:, None] * pt + half)
         here = np.concatenate([middle - half, middle + half], axis=1)
         outside = np.maximum(frame[:2] - here[:, :2], 0.0) + np.maximum(here[:, 2:] - frame[2:], 0.0)
-        cost = _shared(here, boxes) + _shared(here, marks) + 1e3 * outside.sum(axis=1) + 1e-3 * ring
+        cost = _find_overlaps(here, boxes) + _find_overlaps(here, marks) + 1e3 * outside.sum(axis=1) + 1e-3 * ring
         label.set_gid(None)
         best = int(np.argmin(cost))
         boxes = np.concatenate([boxes, here[best : best + 1]])
@@ -256,7 +256,7 @@ def _declutter(axes: Axes, labels: Sequence[Any]) -> None:
         label.arrow_patch.set_visible(bool(ring[best] > _NEAR_PT))
 
 
-def _shared(boxes: FloatArray, others: FloatArray) -> FloatArray:
+def _find_overlaps(boxes: FloatArray, others: FloatArray) -> FloatArray:
     """(K,) area that each box shares with all others; corners as (x0, y0, x1, y1)."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from groups import SPACE_CASE
 
-from evermap.estimate.sparse.system import System, exhausted
+from evermap.estimate.sparse.system import System, exhaust
 from evermap.estimate.sparse.tree import Factors
 from evermap.geometry import se3
 from evermap.slam.kernels3d import odometry_residual, point_residual
@@ -108,8 +108,8 @@ def test_optimum_and_marginals_in_space_are_gtsams(seed):
     session = Session(seed)
     system, pose, point = session.system(), session.start.copy(), session.start_point.copy()
     for _ in range(30):
-        solved = exhausted(system.factorised(session.values(pose, point)))
-        step = exhausted(solved.solution())
+        solved = exhaust(system.factorised(session.values(pose, point)))
+        step = exhaust(solved.solution())
         pose = se3.retract(pose, step[: 6 * N].reshape(N, 6))
         point = point + step[6 * N :].reshape(K, 3)
         if np.abs(step).max() < 1e-11:
@@ -118,7 +118,7 @@ def test_optimum_and_marginals_in_space_are_gtsams(seed):
     for i in range(N):
         assert SPACE_CASE.matrix(pose[i]) == pytest.approx(their_pose[i], abs=1e-6)
     assert point == pytest.approx(their_point, abs=1e-6)
-    solved = exhausted(system.factorised(session.values(pose, point)))
+    solved = exhaust(system.factorised(session.values(pose, point)))
     for i in (0, N // 2, N - 1):
         theirs = marginals.marginalCovariance(i)
         mine = solved.joint(np.array([i]))

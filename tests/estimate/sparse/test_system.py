@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from evermap.errors import DataError, NumericalError
 from evermap.estimate.sparse import system as sparse_system
-from evermap.estimate.sparse.system import Factorised, System, exhausted
+from evermap.estimate.sparse.system import Factorised, System, exhaust
 from evermap.estimate.sparse.tree import Factors
 
 PLANE, SPACE = (3, 2, 9), (6, 3, 12)
@@ -80,7 +80,7 @@ class World:
 
     def solved(self, border: np.ndarray) -> Factorised:
         system = System(self.dim, self.factors, self.coordinate, border)
-        return exhausted(system.factorised(self.values, extra=self.extra))
+        return exhaust(system.factorised(self.values, extra=self.extra))
 
 
 def close(found: np.ndarray, expected: np.ndarray) -> bool:
@@ -99,9 +99,9 @@ def test_solution_and_covariances_are_those_of_dense_algebra(large, dims, seed, 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sparse_system, "LARGE", large)
         solved = world.solved(np.array([shared]))
-    assert close(exhausted(solved.solution()), covariance @ right)
+    assert close(exhaust(solved.solution()), covariance @ right)
     assert solved.log_determinant == pytest.approx(np.linalg.slogdet(information)[1], rel=1e-9, abs=1e-9)
-    spread = exhausted(solved.spread(n_poses - 1))
+    spread = exhaust(solved.spread(n_poses - 1))
     for v, (first, last) in enumerate(zip(spread.own_first[:-1], spread.own_first[1:], strict=True)):
         mine = world.numbers([v])
         assert close(spread.own[first:last].reshape(len(mine), -1), covariance[np.ix_(mine, mine)])
@@ -129,7 +129,7 @@ def test_another_right_side_is_solved_as_if_factorised_with_it(dims, border):
     before, (information, _, jacobians) = solved.own_right.copy(), world.dense()
     expected = np.linalg.solve(information, np.concatenate(jacobians).T @ right)
     other = solved.with_right(right)
-    assert close(exhausted(other.solution()), expected)
+    assert close(exhaust(other.solution()), expected)
     world.values = world.values.copy()
     world.values[solved.system.right_at] = right
     again = world.solved(np.array(border))
@@ -145,8 +145,8 @@ def test_places_that_all_depend_on_each_other_are_solved_as_by_dense_algebra():
     covariance = np.linalg.inv(information)
     solved = world.solved(np.array([len(world.dim) - 1]))
     assert np.count_nonzero(solved.system._large) >= 2
-    assert close(exhausted(solved.solution()), covariance @ right)
-    spread = exhausted(solved.spread())
+    assert close(exhaust(solved.solution()), covariance @ right)
+    spread = exhaust(solved.spread())
     own = [covariance[np.ix_(at, at)].ravel() for at in map(world.numbers, np.arange(len(world.dim))[:, None])]
     assert close(spread.own, np.concatenate(own))
 
@@ -160,7 +160,7 @@ def test_a_direction_that_rounding_alone_determines_ends_in_no_error_before_the_
     world.extra[:] = 0.0
     solved = world.solved(np.array([len(world.dim) - 1]))
     with pytest.raises(NumericalError, match="do not determine"):
-        exhausted(solved.solution())
+        exhaust(solved.solution())
 
 
 @pytest.mark.parametrize("dims", [PLANE, SPACE], ids=["plane", "space"])
@@ -184,9 +184,9 @@ def test_work_in_slices_is_the_work_at_once(monkeypatch):
     system = System(world.dim, world.factors, world.coordinate, border)
     slices = system.factorised(world.values, extra=world.extra)
     assert len(list(system.cuts(system.tree.own * system.tree.size**2))) > 20
-    solved = exhausted(slices)
-    assert np.array_equal(exhausted(solved.solution()), exhausted(at_once.solution()))
-    assert np.array_equal(exhausted(solved.spread()).own, exhausted(at_once.spread()).own)
+    solved = exhaust(slices)
+    assert np.array_equal(exhaust(solved.solution()), exhaust(at_once.solution()))
+    assert np.array_equal(exhaust(solved.spread()).own, exhaust(at_once.spread()).own)
 
 
 def test_fronts_stay_small_where_little_is_shared():
@@ -207,4 +207,4 @@ def test_a_border_that_nothing_determines_is_named():
     world.values[:] = 0.0
     world.extra[world.numbers([7])] = 0.0
     with pytest.raises(NumericalError, match="do not determine"):
-        exhausted(world.solved(np.array([7])).solution())
+        exhaust(world.solved(np.array([7])).solution())

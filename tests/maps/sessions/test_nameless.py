@@ -19,7 +19,7 @@ from evermap.maps.living import LivingMap, MemberTraits
 from evermap.maps.sessions.believe import Witnessed
 from evermap.maps.sessions.decide import doubt_moves
 from evermap.maps.sessions.extend import Extended
-from evermap.maps.sessions.nameless import held_at, without_ids
+from evermap.maps.sessions.nameless import hold_at, without_ids
 from evermap.maps.sessions.session import Session, with_traits
 from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
@@ -47,7 +47,7 @@ def test_what_is_held_is_predicted_by_the_others(group: Group) -> None:
     motion = group.exp(rng.normal(0.0, 1.0, group.dim))
     at = group.transform(motion, place)[held] + rng.normal(0.0, 0.05, (len(held), dim))
     drift_m = 0.03
-    found = held_at(local, held, at, known, OverlayConfig(drifts_m=(drift_m,), drifts_in_space_m=()))
+    found = hold_at(local, held, at, known, OverlayConfig(drifts_m=(drift_m,), drifts_in_space_m=()))
     assert found.drift_m == drift_m
 
     about = rigid(place[held], at)

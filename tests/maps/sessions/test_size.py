@@ -18,8 +18,8 @@ from evermap.maps.sessions.gaussian import (
     AS_GOOD,
     agreed,
     log_ratio,
+    settle_scales,
     settled,
-    settled_by,
 )
 from evermap.types import FloatArray, landmark_id_of
 
@@ -167,7 +167,7 @@ def _fleet(robots: FloatArray, sigma: float, turns: int) -> tuple[float, LivingM
     told: set[int] = set()
     for turn in range(1, turns):
         k = turn % len(robots)
-        found, metres = settled_by((metre - robots[k], 1e-6), (0.0, sigma), living, names[k])
+        found, metres = settle_scales((metre - robots[k], 1e-6), (0.0, sigma), living, names[k])
         metre += np.log(found.map_factor)
         assert np.log(found.session_factor) == pytest.approx(metre - robots[k], abs=1e-3)
         living = replace(
@@ -203,7 +203,7 @@ def test_the_metre_of_one_robot_is_that_of_its_sessions_with_and_without_a_name(
     named = LivingMap(log_size_variance=sigma**2, log_size_information=1.0 / sigma**2, metres=first)
     variance, information = sigma**2, 1.0 / sigma**2
     for shown in rng.normal(0.0, sigma, 8):
-        found, metres = settled_by((shown, 1e-6), (0.0, sigma), named, "one")
+        found, metres = settle_scales((shown, 1e-6), (0.0, sigma), named, "one")
         wanted = settled(shown, 1e-6, (0.0, sigma), variance, information)
         assert (found.map_factor, found.session_factor) == (
             pytest.approx(wanted.map_factor, abs=1e-15),
@@ -215,7 +215,7 @@ def test_the_metre_of_one_robot_is_that_of_its_sessions_with_and_without_a_name(
 
 
 def test_a_survey_knows_the_metre_better_than_a_robot() -> None:
-    found, metres = settled_by((0.05, 1e-6), (0.0, 0.02), LivingMap(), "one")
+    found, metres = settle_scales((0.05, 1e-6), (0.0, 0.02), LivingMap(), "one")
     assert abs(np.log(found.map_factor)) < 0.1 * 0.05
     assert len(metres) == 2
 

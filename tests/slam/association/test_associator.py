@@ -17,7 +17,7 @@ from recordings import building
 
 from evermap.config import Config, SlamConfig
 from evermap.geometry import se2
-from evermap.maps.sessions.nameless import numbered_in
+from evermap.maps.sessions.nameless import number_in
 from evermap.metrics.summary import compare_with_truth
 from evermap.pipeline import run_slam
 from evermap.slam import linearise, preintegration
@@ -34,7 +34,7 @@ from evermap.slam.association.revise import (
     HIDDEN,
     LOOK_BINS,
     likely_real,
-    reassigned,
+    reassign,
     unseen_nats,
     with_overlooked,
 )
@@ -80,7 +80,7 @@ def test_noise_of_the_odometry_is_learned_from_far_too_much(seed: int) -> None:
     )
     for _ in made.problem.stamp_s:
         associator.step()
-    learned = associator.learned_odometry(associator.finish())
+    learned = associator.learn_odometry(associator.finish())
     driven = made.problem.drive.between(made.problem.stamp_s, made.truth.states)
     found, true = (
         np.sqrt(np.einsum("nkaa,k->a", driven.noise, sigma**2) / 399) for sigma in (learned, made.noise.odometry)
@@ -158,7 +158,7 @@ def test_how_the_work_is_cut_changes_no_bit(seed: int, monkeypatch: pytest.Monke
 
 def test_plane_and_space_share_all_but_what_depends_on_the_group() -> None:
     """One loop of each kind: both define the abstract methods, and nothing else of the same name."""
-    left = {"_solved"}  # two optima, with different arguments
+    left = {"_solve_assignment"}  # two optima, with different arguments
     planar, spatial = (
         {name for name, value in vars(one).items() if inspect.isfunction(value) and not name.startswith("__")}
         for one in (PlanarAssociator, SpatialAssociator)
@@ -192,7 +192,7 @@ def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPat
     broken = found.split([np.flatnonzero((row == 2) & (pose // 12 == part)) for part in range(1, 5)])
     late = np.where(row == 1, 0, np.where(row == 0, NOBODY, row))  # of one landmark, after a while that of another
     twisted = replace(found, landmark_row=np.where(pose > 45, late, np.where((row == 0) & (pose > 15), NOBODY, row)))
-    solved, twisted, trials = associator._solved(broken), associator._solved(twisted), list[int]()
+    solved, twisted, trials = associator._solve_assignment(broken), associator._solve_assignment(twisted), list[int]()
     before, value, other = bits(associator), bits(solved), bits(twisted)
 
     def rejected(*_: object) -> float:
@@ -200,18 +200,18 @@ def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPat
         return -math.inf
 
     with monkeypatch.context() as no:
-        no.setattr("evermap.slam.association.associator.accepted_rise", rejected)
+        no.setattr("evermap.slam.association.associator.find_most_rise", rejected)
         no.setattr("evermap.slam.association.in_plane._is_better", lambda *_: rejected() > 0.0)
         assert associator._merged(solved) is solved
         assert len(trials) > 1
         count = len(trials)
-        assert associator._corrected(twisted, set()) is twisted
+        assert associator._correct_visits(twisted, set()) is twisted
         assert len(trials) > count
     assert (bits(solved), bits(twisted)) == (value, other)
     associator.finish(broken)
     associator.finish(drawn(found, made.noise.odometry, seed=seed, wider=1.0)[0])
     associator.against(broken)
-    associator.learned_odometry(broken)
+    associator.learn_odometry(broken)
     assert bits(associator) == before
 
 
@@ -359,7 +359,7 @@ def test_a_building_without_ids_and_in_its_map() -> None:
     assert scores.completeness > 0.9
     assert recording.true_landmarks is not None
     survey = Landmarks.at(recording.true_landmarks.landmark_id, recording.true_landmarks.position_m, sigma_m=0.02)
-    inside = numbered_in(recording, survey, Config(slam=NAMELESS)).detections.landmark_id
+    inside = number_in(recording, survey, Config(slam=NAMELESS)).detections.landmark_id
     met = np.isin(inside, survey.landmark_id)
     assert met.mean() > 0.5
     assert np.mean(inside[met] == recording.detections.landmark_id[met]) > 0.98
@@ -467,7 +467,7 @@ def test_detections_of_others_go_back_and_what_was_overlooked_is_a_landmark() ->
     row[rng.random(len(true)) < 0.1] = NOBODY
     broken = settled(made, row)
     explained = np.zeros((int(np.sum(row >= 0)), 2, 2))
-    again = reassigned(broken, explained, density=0.1).landmark_row
+    again = reassign(broken, explained, density=0.1).landmark_row
     assert np.mean(again == true) > 0.97
     forgotten = settled(made, np.where(true == 7, NOBODY, true))
     kept = replace(forgotten, estimate=replace(made.truth, landmark=made.truth.landmark[:7]))

@@ -12,7 +12,7 @@ from recordings import building
 
 from evermap import run_slam
 from evermap.config import Config, SlamConfig
-from evermap.maps.sessions.nameless import numbered_in
+from evermap.maps.sessions.nameless import number_in
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.association import with_identities
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, names_of
@@ -140,7 +140,7 @@ def test_names_say_where_in_a_map_it_is() -> None:
     assert recording.true_landmarks is not None
     survey = Landmarks.at(recording.true_landmarks.landmark_id, recording.true_landmarks.position_m, sigma_m=0.02)
     true, some = recording.detections.landmark_id, with_some_named(recording, 0.2)
-    found = numbered_in(some, survey, Config(slam={"unknown_ids": "empty"})).detections.landmark_id
+    found = number_in(some, survey, Config(slam={"unknown_ids": "empty"})).detections.landmark_id
     met = np.isin(found, survey.landmark_id)
     assert np.mean(found[met] == true[met]) > 0.98
     assert met.mean() > 0.8

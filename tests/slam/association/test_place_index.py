@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evermap.geometry import se2, se3
-from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap, list_agreed_pairs
 from evermap.slam.association.place_index import PlaceIndex
 from evermap_studies.sim.warehouse import WarehouseConfig, warehouse_landmarks
 
@@ -94,7 +94,7 @@ def test_it_agrees_with_trying_all():
     for _ in range(4):
         source, _ = local_map(rng, true, count=12)
         allowed = np.ones((len(source.place), len(there)), dtype=bool)
-        tried = dict(agreed_pairs(source, everything, allowed, density=DENSITY, probability=P))
+        tried = dict(list_agreed_pairs(source, everything, allowed, density=DENSITY, probability=P))
         mine = dict(index.pairs(source, density=DENSITY, probability=P))
         assert mine.items() >= {k: m for k, m in tried.items() if k in mine}.items()
         assert len(mine) >= len(tried) - 1
@@ -123,7 +123,7 @@ def test_a_part_of_a_map_in_space_is_found_in_it(seed):
     motions = list(index.motions(source.place, source.beside_m))
     target = LocalMap(true, SIGMA_M**2 * np.eye(3 * len(true)))
     allowed = np.ones((count, len(true)), dtype=bool)
-    pairs = agreed_pairs(source, target, allowed, density=DENSITY, probability=P, motions=motions)
+    pairs = list_agreed_pairs(source, target, allowed, density=DENSITY, probability=P, motions=motions)
     assert len(pairs) >= 9
     assert all(rows[k] == m for k, m in pairs if k < count - 3)
     assert all(k < count - 3 for k, _ in pairs)
@@ -140,6 +140,6 @@ def test_orientations_decide_between_the_two_sides_of_a_wall():
     found = []
     for rotation in (None, facing):
         target = LocalMap(wall, SIGMA_M**2 * np.eye(3 * len(wall)), rotation)
-        found.append(agreed_pairs(target, target, allowed, density=DENSITY, probability=P, motions=motions))
+        found.append(list_agreed_pairs(target, target, allowed, density=DENSITY, probability=P, motions=motions))
     assert found[0] == []
     assert sorted(found[1]) == [(k, k) for k in range(len(wall))]

@@ -12,7 +12,7 @@ import pytest
 from space.corridors import tagged_corridor
 
 from evermap.config import AssociationConfig, Config, Section, SlamConfig
-from evermap.maps.sessions.nameless import numbered_in
+from evermap.maps.sessions.nameless import number_in
 from evermap.slam.association import describe_doubts, with_identities
 from evermap.slam.association.constellation import LocalMap
 from evermap.slam.association.place_index import PlaceIndex
@@ -57,7 +57,7 @@ def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
     settings = Watched(SlamConfig(unknown_ids=True), read)
     config: Any = SimpleNamespace(slam=settings, living=Config().living)
     assert park.true_landmarks is not None
-    numbered_in(park, park.true_landmarks, config)
+    number_in(park, park.true_landmarks, config)
     place = rng.uniform(0.0, 40.0, (40, 2))
     index = PlaceIndex(place, np.tile(1e-4 * np.eye(2), (40, 1, 1)), settings=settings)
     assert len(index.pairs(LocalMap(place, 1e-4 * np.eye(80)), density=0.01, probability=0.97)) == len(place)

@@ -9,12 +9,12 @@ import pytest
 from problems import World, make_world
 
 from evermap.config import Config
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.features import Traits
 from evermap.slam.association.in_plane import BEFORE
-from evermap.slam.association.wrong_associations import Visits, displaced_stretches, laid, weighed_visits
+from evermap.slam.association.wrong_associations import Visits, find_displaced, laid, weigh_visits
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.noise import START
@@ -35,8 +35,8 @@ PARK = ParkConfig(
 
 def solved(made: World, assignment: Assignment) -> tuple[Assignment, Marginals, Smoother]:
     smoother = Smoother(assignment.problem(), made.noise, heavy=False)
-    slices = smoother.solved_in_slices(assignment.estimate, iterations=20, tolerance=1e-9, settled=0.0)
-    estimate, marginals = exhausted(slices)
+    slices = smoother.solve_in_slices(assignment.estimate, iterations=20, tolerance=1e-9, settled=0.0)
+    estimate, marginals = exhaust(slices)
     return replace(assignment, estimate=estimate), marginals, smoother
 
 
@@ -57,7 +57,7 @@ def two_visits(seed: int, off_m: float = 0.0) -> tuple[World, Assignment, np.nda
 
 def weighed(made: World, assignment: Assignment) -> Visits:
     found, marginals, smoother = solved(made, assignment)
-    every = weighed_visits(found, marginals, smoother.detections(found.estimate), density=0.1)
+    every = weigh_visits(found, marginals, smoother.detections(found.estimate), density=0.1)
     mine = np.flatnonzero(every.landmark == TWICE)
     return Visits([every.rows[k] for k in mine], *(each[mine] for each in every[1:]))
 
@@ -83,7 +83,7 @@ def test_where_nothing_is_a_landmark_there_are_no_visits() -> None:
     made, assignment, _ = two_visits(0)
     nothing = assignment.without(np.ones(8, dtype=bool))
     _, marginals, smoother = solved(made, assignment)
-    visits = weighed_visits(nothing, marginals, smoother.detections(assignment.estimate), density=0.1)
+    visits = weigh_visits(nothing, marginals, smoother.detections(assignment.estimate), density=0.1)
     assert len(visits.rows) == len(visits.evidence) == 0
 
 
@@ -138,7 +138,7 @@ def error_m(made: World, assignment: Assignment) -> float:
 def test_a_stretch_that_lies_beside_itself_is_found_and_laid_where_it_belongs(seed: int) -> None:
     made, assignment, tree = kicked(seed)
     bent, marginals, _ = solved(made, assignment)
-    found = displaced_stretches(bent, marginals, bent.sightings >= 3, density=0.01, probability=0.97)
+    found = find_displaced(bent, marginals, bent.sightings >= 3, density=0.01, probability=0.97)
     assert len(found) > 5
     for stretch in found:
         np.testing.assert_array_equal(tree[stretch.younger], tree[stretch.older])

@@ -12,7 +12,7 @@ from references import log_group_prior, log_normal, random_covariance, static_ev
 from test_gain import gain_of
 
 from evermap.config import ChangesConfig, RangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.calibration import AHEAD, ASIDE, FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.problem import Estimate, Problem, independent
@@ -26,7 +26,7 @@ RANGES = RangesConfig()
 def evidence_of(world: World, bounds: list[int], estimate: Estimate | None = None) -> WindowEvidence:
     estimate = world.truth if estimate is None else estimate
     problem = world.problem
-    return exhausted(landmark_evidence(problem, estimate, world.noise, problem.prior, np.array(bounds), 3, RANGES))
+    return exhaust(landmark_evidence(problem, estimate, world.noise, problem.prior, np.array(bounds), 3, RANGES))
 
 
 def with_move(world: World, name: int, shift_m: tuple[float, float], since: int) -> World:
@@ -110,7 +110,7 @@ def test_ranges_of_what_moved_are_linear_where_it_is_by_then() -> None:
     problem = replace(problem, sigma_given=sigma)
     moved = replace(world.truth, landmark=np.vstack([world.truth.landmark, world.truth.landmark[2] + [0.7, -0.4]]))
     row = np.array([[0, 1, 2, 3, 4], [0, 1, 5, 3, 4], [0, 1, 5, 3, 4]])
-    evidence = exhausted(landmark_evidence(problem, moved, world.noise, problem.prior, bounds, 3, RANGES, row=row))
+    evidence = exhaust(landmark_evidence(problem, moved, world.noise, problem.prior, bounds, 3, RANGES, row=row))
     at = evidence.position - evidence.position[0]
     expected = moved.landmark[row[evidence.window, evidence.landmark]]
     scale = np.linalg.norm(at[1]) / np.linalg.norm(expected[1] - expected[0])  # of all by the prior of the metre
@@ -220,7 +220,7 @@ def test_softened_adds_an_error_to_every_copy() -> None:
         optimum = covariance @ evidence.pull
         differences = []
         for sigma in (0.01, 0.05, 0.3):
-            soft = evidence.softened(sigma)
+            soft = evidence.soften(sigma)
             expected = covariance + sigma**2 * np.eye(size)
             np.testing.assert_allclose(soft.information, np.linalg.inv(expected), rtol=1e-6, atol=1e-6)
             np.testing.assert_allclose(np.linalg.solve(soft.information, soft.pull), optimum, atol=1e-9)
@@ -233,7 +233,7 @@ def test_softened_adds_an_error_to_every_copy() -> None:
         density = 0.5 * (volume - off @ evidence.information @ off - size * np.log(2.0 * np.pi))
         plain = evidence.pull @ x - 0.5 * x @ evidence.information @ x - density
         assert differences[0] == pytest.approx(plain, abs=1e-6)
-        assert evidence.softened(0.0) is evidence
+        assert evidence.soften(0.0) is evidence
 
 
 def test_without_is_marginalisation() -> None:

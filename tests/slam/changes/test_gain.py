@@ -18,7 +18,7 @@ from references import (
 from scipy.integrate import quad
 
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
@@ -49,7 +49,7 @@ def gain_of(
     prior: ChangesConfig = PRIOR,
 ) -> tuple[float, np.ndarray]:
     count = len(position)
-    quadratic, linear = exhausted(item_columns(evidence, comparison, position, n_windows, np.arange(count)))
+    quadratic, linear = exhaust(item_columns(evidence, comparison, position, n_windows, np.arange(count)))
     return hypothesis_gain(
         np.array(label),
         np.array([0, *onset]),

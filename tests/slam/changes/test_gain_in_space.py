@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.gain import (
     PLACES,
@@ -66,7 +66,7 @@ def comparison_of(e: np.ndarray, covariance: np.ndarray) -> Comparison:
 def gain_of(comparison: Comparison, position: np.ndarray, numbers: int, label: list[int], turns: list[bool]):
     count = len(position)
     evidence = evidence_of(position, numbers)
-    quadratic, linear = exhausted(item_columns(evidence, comparison, position, 1, np.arange(count)))
+    quadratic, linear = exhaust(item_columns(evidence, comparison, position, 1, np.arange(count)))
     tables = Tables(
         quadratic, linear, position, turning_columns(numbers), motion_spread(PRIOR, numbers),
         log_prior(PRIOR, count, count, numbers=numbers), log_onset(1),
@@ -166,9 +166,7 @@ def test_search_finds_the_groups_that_moved_in_space(numbers: int) -> None:
         e = displaced(position, shelf, motion, numbers)
         e += displaced(position, np.array([6]), np.array([-0.3, 0.4, 0.2, 0.0, 0.0, 0.0]), numbers)
         e += rng.multivariate_normal(np.zeros(len(e)), covariance)
-        found = exhausted(
-            find_changes(evidence_of(position, numbers), comparison_of(e, covariance), position, 1, PRIOR)
-        )
+        found = exhaust(find_changes(evidence_of(position, numbers), comparison_of(e, covariance), position, 1, PRIOR))
         np.testing.assert_array_equal(found.label[0] == found.label[0, 1], np.isin(np.arange(10), shelf))
         np.testing.assert_array_equal(np.flatnonzero(found.label[0]), np.sort(np.append(shelf, 6)))
         assert found.turns[0, found.label[0, 1]]
@@ -182,9 +180,7 @@ def test_search_finds_nothing_where_only_the_whole_is_elsewhere(numbers: int) ->
         position = rng.uniform(-4.0, 4.0, (10, 3))
         covariance = space_covariance(rng, position, numbers)
         e = rng.multivariate_normal(np.zeros(len(covariance)), covariance)
-        found = exhausted(
-            find_changes(evidence_of(position, numbers), comparison_of(e, covariance), position, 1, PRIOR)
-        )
+        found = exhaust(find_changes(evidence_of(position, numbers), comparison_of(e, covariance), position, 1, PRIOR))
         assert not found.label[0].any()
 
 

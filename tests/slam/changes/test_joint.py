@@ -73,7 +73,7 @@ def test_what_was_thought_on_the_way_can_be_thought_again(with_map: bool) -> Non
     noise = session.world.noise
     before = method.revise(session.problem, estimate, noise, heavy=True, final=False)
     assert len(before.estimate.landmark) > len(session.before)  # places were added
-    problem, estimate = method.unprejudiced(before.problem, before.estimate)
+    problem, estimate = method.unprejudice(before.problem, before.estimate)
     estimate = Smoother(problem, noise).optimum(estimate, tolerance=1e-4)
     last = method.revise(problem, estimate, noise, heavy=False, final=True)
     assert all_found(last.changes, WITHIN)

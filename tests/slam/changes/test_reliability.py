@@ -10,7 +10,7 @@ from references import static_evidence
 from worlds import Move, make_session
 
 from evermap.config import ChangesConfig, RangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.weigh import MAP_FACTORS, ChangePosterior, weigh
@@ -89,7 +89,7 @@ def posterior_on_drawn_evidence(seed: int, n_windows: int) -> tuple[float, bool]
     evidence = replace(plain, position=plain.position + e, information=information)
     mean = position + factor * SIGMA_MAP_M * rng.normal(size=position.shape)
     covariance = np.tile(SIGMA_MAP_M**2 * np.eye(2), (N_LANDMARKS, 1, 1))
-    posterior = exhausted(weigh(evidence, GivenMap(mean, covariance, np.ones(N_LANDMARKS, bool)), PRIOR, n_windows))
+    posterior = exhaust(weigh(evidence, GivenMap(mean, covariance, np.ones(N_LANDMARKS, bool)), PRIOR, n_windows))
     return posterior.probability, is_right(posterior, moves)
 
 
@@ -136,7 +136,7 @@ def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
         )
         estimate = Smoother(free, world.noise).optimum(world.truth)
         bounds = np.linspace(0, 200, n_windows + 1).astype(int)
-        evidence = exhausted(
+        evidence = exhaust(
             landmark_evidence(free, estimate, world.noise, world.problem.prior, bounds, 3, RangesConfig())
         )
         comparison = compare(evidence, given.mean, given.covariance, given.given)

@@ -9,7 +9,7 @@ import pytest
 from references import static_evidence
 
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup
 from evermap.slam.changes.search import find_changes
@@ -38,12 +38,12 @@ def dropped(evidence: WindowEvidence, given: GivenMap) -> set[tuple[int, int]]:
     """(landmark, window) of the copies left out."""
 
     def search(evidence, start):
-        soft = evidence.softened(0.02)
+        soft = evidence.soften(0.02)
         comparison = compare(soft, given.mean, given.covariance, given.given)
         found = yield from find_changes(soft, comparison, given.mean, WINDOWS, PRIOR, start=start)
         return comparison, found
 
-    kept = exhausted(without_transients(evidence, given.mean, given, PRIOR, search))
+    kept = exhaust(without_transients(evidence, given.mean, given, PRIOR, search))
     left = set(zip(kept.landmark.tolist(), kept.window.tolist(), strict=True))
     return set(zip(evidence.landmark.tolist(), evidence.window.tolist(), strict=True)) - left
 
@@ -64,7 +64,7 @@ def test_displaced_in_one_window_only(seed: int, window: int) -> None:
     shift[window, 2] = [0.5, 0.3]
     evidence, given = evidence_with(shift, seed)
     assert dropped(evidence, given) == {(2, window)}
-    assert exhausted(weigh(evidence, given, PRIOR, WINDOWS)).groups == ()
+    assert exhaust(weigh(evidence, given, PRIOR, WINDOWS)).groups == ()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -74,7 +74,7 @@ def test_lasting_moves_stay(seed: int, since: int) -> None:
     shift[since:, [2, 4]] = [0.5, 0.3]
     evidence, given = evidence_with(shift, seed)
     assert dropped(evidence, given) == set()
-    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
+    verdict = exhaust(weigh(evidence, given, PRIOR, WINDOWS))
     assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([2, 4], since)]
     np.testing.assert_allclose(verdict.groups[0].motion[:2], [0.5, 0.3], atol=0.06)
 
@@ -86,7 +86,7 @@ def test_a_transient_beside_a_lasting_move(seed: int) -> None:
     shift[2, 3] = [0.6, 0.0]
     evidence, given = evidence_with(shift, seed)
     assert dropped(evidence, given) == {(3, 2)}
-    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
+    verdict = exhaust(weigh(evidence, given, PRIOR, WINDOWS))
     assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([0, 4], 1)]
 
 
@@ -98,7 +98,7 @@ def test_what_is_seen_elsewhere_in_the_last_window_has_moved(seed: int, is_mappe
     shift[3, 2] = [0.5, 0.3]
     evidence, given = evidence_with(shift, seed)
     given = given if is_mapped else GivenMap.empty(COUNT)
-    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
+    verdict = exhaust(weigh(evidence, given, PRIOR, WINDOWS))
     assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([2], 3)]
     np.testing.assert_allclose(verdict.groups[0].motion[:2], [0.5, 0.3], atol=0.08)
 
@@ -108,7 +108,7 @@ def test_first_sightings_that_are_a_little_off_are_no_move(seed: int) -> None:
     """A drive begins with what is least certain: on MRCLAM such a landmark had "moved" by .23 m, for certain."""
     shift = none()
     shift[0, 2] = [0.3, 0.2]
-    assert not exhausted(weigh(evidence_with(shift, seed)[0], GivenMap.empty(COUNT), PRIOR, WINDOWS)).groups
+    assert not exhaust(weigh(evidence_with(shift, seed)[0], GivenMap.empty(COUNT), PRIOR, WINDOWS)).groups
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -118,7 +118,7 @@ def test_two_that_exchange_their_places_across_the_room_have_moved(seed: int) ->
     shift[1:, 1], shift[3, 4] = apart, -apart
     evidence = evidence_with(shift, seed)[0]
     evidence = evidence.without((evidence.landmark == 4) & (evidence.window == 2))
-    verdict = exhausted(weigh(evidence, GivenMap.empty(COUNT), PRIOR, WINDOWS))
+    verdict = exhaust(weigh(evidence, GivenMap.empty(COUNT), PRIOR, WINDOWS))
     told = {tuple(group.members.tolist()): group for group in verdict.groups}
     assert told.keys() == {(1,), (4,)}
     np.testing.assert_allclose(told[(1,)].motion, [*apart, 0.0], atol=0.1)
@@ -131,7 +131,7 @@ def test_three_that_moved_apart_at_one_time_are_no_body(seed: int) -> None:
     shift = none()
     shift[2:, [1, 2, 4]] = [[0.9, 0.1], [-0.5, 0.7], [0.1, -0.9]]
     evidence, given = evidence_with(shift, seed)
-    verdict = exhausted(weigh(evidence, given, PRIOR, WINDOWS))
+    verdict = exhaust(weigh(evidence, given, PRIOR, WINDOWS))
     told = [(group.members.tolist(), group.window, group.turns) for group in verdict.groups]
     assert told == [([row], 2, False) for row in (1, 2, 4)]
 

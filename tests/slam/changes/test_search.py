@@ -7,7 +7,7 @@ import pytest
 from references import all_labellings, comparison_of, gains_of_all, slam_like_covariance, static_evidence
 
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.changes.search import find_changes
 
 PRIOR = ChangesConfig(p_rotated=0.0)
@@ -33,7 +33,7 @@ def test_search_finds_the_best_of_all_hypotheses(worlds: int) -> None:
     found = 0
     for seed in range(worlds):
         position, comparison = random_comparison(seed)
-        hypotheses = exhausted(find_changes(static_evidence(position), comparison, position, 1, PRIOR))
+        hypotheses = exhaust(find_changes(static_evidence(position), comparison, position, 1, PRIOR))
         labels = enumerated[len(position)]
         gains = gains_of_all(labels, comparison, PRIOR)
         best = int(np.argmax(gains))
@@ -51,7 +51,7 @@ def test_weights_of_what_was_kept_are_nearly_those_of_everything() -> None:
     worst = 0.0
     for seed in range(20):
         position, comparison = random_comparison(seed)
-        hypotheses = exhausted(find_changes(static_evidence(position), comparison, position, 1, PRIOR))
+        hypotheses = exhaust(find_changes(static_evidence(position), comparison, position, 1, PRIOR))
         gains = gains_of_all(enumerated[len(position)], comparison, PRIOR)
         kept = 1.0 / np.exp(hypotheses.gain - hypotheses.gain[0]).sum()
         whole = 1.0 / np.exp(gains - gains.max()).sum()
@@ -62,7 +62,7 @@ def test_weights_of_what_was_kept_are_nearly_those_of_everything() -> None:
 
 def test_no_hypothesis_is_told_twice_and_the_best_comes_first() -> None:
     position, comparison = random_comparison(3)
-    hypotheses = exhausted(find_changes(static_evidence(position), comparison, position, 1, ChangesConfig()))
+    hypotheses = exhaust(find_changes(static_evidence(position), comparison, position, 1, ChangesConfig()))
     rows = np.column_stack([hypotheses.label, hypotheses.onset, hypotheses.turns])
     assert len(np.unique(rows, axis=0)) == len(rows)
     assert np.all(np.diff(hypotheses.gain) <= 0.0)
@@ -78,6 +78,6 @@ def test_large_maps_are_searched_among_their_likeliest() -> None:
     e = 0.03 * rng.normal(size=120)
     moved = np.array([3, 30, 31, 59])
     e.reshape(60, 2)[moved] += [0.3, -0.2]
-    hypotheses = exhausted(find_changes(static_evidence(position), comparison_of(e, covariance), position, 1, PRIOR))
+    hypotheses = exhaust(find_changes(static_evidence(position), comparison_of(e, covariance), position, 1, PRIOR))
     np.testing.assert_array_equal(np.flatnonzero(hypotheses.label[0]), moved)
     np.testing.assert_allclose(hypotheses.motion[0, 0, :2], [0.3, -0.2], atol=0.05)

@@ -65,7 +65,7 @@ class Session:
     def revised(self, prior: ChangesConfig | None = None) -> tuple[Joint, Explanation]:
         """What the method makes of the whole session, as the estimator asks it at the end."""
         method = self.method(prior)
-        problem, estimate = method.unprejudiced(self.problem, self.static)
+        problem, estimate = method.unprejudice(self.problem, self.static)
         estimate = Smoother(problem, self.world.noise, heavy=True).optimum(estimate, tolerance=1e-4)
         return method, method.revise(problem, estimate, self.world.noise, heavy=False, final=True)
 

@@ -15,7 +15,7 @@ from evermap import run_session, run_slam
 from evermap.config import Config, SlamConfig
 from evermap.errors import DataError
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.nameless import numbered_in
+from evermap.maps.sessions.nameless import number_in
 from evermap.maps.sessions.session import Session
 from evermap.slam.association import with_identities
 from evermap.slam.association.in_space import SpatialAssignment, SpatialAssociator
@@ -99,7 +99,7 @@ def test_rejected_trials_in_space_change_nothing(monkeypatch):
     late = associator._problem.pose_row > np.median(associator._problem.pose_row)
     twice = np.where(late & (found.landmark_row == 2), found.landmark_row.max() + 1, found.landmark_row)
     start = SpatialAssignment(twice, found.estimate.pose, found.noise, found.traits)
-    solved, trials = associator._solved(start), list[int]()
+    solved, trials = associator._solve_assignment(start), list[int]()
     before, value = bits(associator), bits(solved)
 
     def rejected(*_: object) -> float:
@@ -107,7 +107,7 @@ def test_rejected_trials_in_space_change_nothing(monkeypatch):
         return -math.inf
 
     with monkeypatch.context() as no:
-        no.setattr("evermap.slam.association.associator.accepted_rise", rejected)
+        no.setattr("evermap.slam.association.associator.find_most_rise", rejected)
         assert associator._merged(solved) is solved
     assert trials
     assert len(associator._merged(solved).estimate.place) == len(found.estimate.place)
@@ -193,7 +193,7 @@ def test_points_are_found_in_a_fixed_map_from_anywhere_and_new_ones_get_numbers_
     true = hall(seed, n_points=60, n_frames=400, step_s=0.6, drift=0.05).true_landmarks
     assert true is not None
     survey = replace(rows_of(true, np.arange(60) >= 6), landmark_id=true.landmark_id[6:] + 100)
-    found = numbered_in(drive, survey, NAMELESS)
+    found = number_in(drive, survey, NAMELESS)
     name = named_as(drive, found)
     known = {one: real for one, real in name.items() if one >= 100}
     assert all(one == real + 100 for one, real in known.items())

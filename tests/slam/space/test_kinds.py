@@ -163,14 +163,14 @@ def test_what_means_nothing_in_space_is_told(folder: Path, name: str, text: str,
 @pytest.mark.slow
 def test_settings_of_the_sensor_hold_in_space() -> None:
     given = (SpatialSensor(), SpatialSensor("other", range_max_m=3.0))
-    changed = SensorConfig(kind="laser", range_max_m=5.0, sigma_position_m=0.1).applied_in_space(given)
+    changed = SensorConfig(kind="laser", range_max_m=5.0, sigma_position_m=0.1).apply_in_space(given)
     assert {(one.kind, one.range_max_m, one.sigma_position_m) for one in changed} == {(SensorKind.LASER, 5.0, 0.1)}
     config = Config(sensor={"kind": "laser"})
     assert told(run_slam(driven(odometry=1.0 / 1.04), config), "odometry_scale")[0] == pytest.approx(1.04, abs=0.01)
     for name in ("bearing_max_rad", "sigma_range_m", "sigma_offset_m", "sigma_askew_rad"):
         with pytest.raises(ConfigError, match=rf"sensor\.{name}.*not used for a recording in space \(try: "):
-            SensorConfig(**{name: 0.1}).applied_in_space(given)
+            SensorConfig(**{name: 0.1}).apply_in_space(given)
     with pytest.raises(ConfigError, match=r"mount_robot_sensor.*\[mount\]"):
         run_slam(driven(), Config(sensor={"mount_robot_sensor": (0.0, 0.0, 0.0)}))
     with pytest.raises(ConfigError, match=r"range_min_m.*7 is not below range_max_m = 3"):
-        SensorConfig(range_min_m=7.0).applied_in_space(given)
+        SensorConfig(range_min_m=7.0).apply_in_space(given)

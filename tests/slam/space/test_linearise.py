@@ -77,7 +77,7 @@ KINDS = [
 @pytest.mark.parametrize(("kind", "oriented", "alike"), KINDS)
 def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, seed, delay):
     ray = alike == "ray"
-    symmetry = Symmetry.generated(() if ray else alike or ())
+    symmetry = Symmetry.generate_group(() if ray else alike or ())
     seen, pose, place, mount = a_sighting(kind, oriented, seed, symmetry, ray=ray)
     place = se3.compose(place, np.append(np.zeros(3), symmetry.turns[-1])) if oriented else place
     velocity = np.random.default_rng(seed).normal(0.0, 1.0, (1, 6))
@@ -116,7 +116,7 @@ def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, 
 )
 def test_of_what_looks_the_same_the_most_probable_counts(generators, group, seed):
     """Against the factor without symmetries, of every equivalent measurement."""
-    seen, pose, place, mount = a_sighting(POSE, True, seed, Symmetry.generated(generators))
+    seen, pose, place, mount = a_sighting(POSE, True, seed, Symmetry.generate_group(generators))
     turn = Rotation.from_quat(seen.measured[0, 3:])
     nothing, costs = np.zeros((1, 6)), []
     for one in group:

@@ -13,7 +13,7 @@ from evermap.config import Config
 from evermap.io.spatial import spatial_detections
 from evermap.metrics.summary import compare_with_truth
 from evermap.pipeline import run_slam
-from evermap.slam.space.estimate import converged, first_places
+from evermap.slam.space.estimate import converge, first_places
 from evermap.slam.space.intake import prepare_space, start_noise
 from evermap.slam.space.linearise import ACROSS, ALONG
 from evermap.slam.space.range_noise import learn_range_noise, with_range_noise
@@ -183,7 +183,7 @@ def test_noise_that_is_not_to_be_learned_is_not() -> None:
     recording = field(6, LAWS["constant"], n_frames=60)
     intake = prepare_space(recording, Config().slam.space, estimate_noise=False)
     start = first_places(intake.problem, intake.driven_pose)
-    optimum = converged(intake.problem, start, start_noise(intake.problem.settings, driven=True))
+    optimum = converge(intake.problem, start, start_noise(intake.problem.settings, driven=True))
     assert with_range_noise(optimum) is optimum
 
 
@@ -192,7 +192,7 @@ def test_few_detections_keep_the_shape_of_usual_noise() -> None:
     recording = field(7, LAWS["constant"], n_frames=150)
     intake = prepare_space(recording, Config().slam.space)
     start = first_places(intake.problem, intake.driven_pose)
-    optimum = converged(intake.problem, start, start_noise(intake.problem.settings, driven=True))
+    optimum = converge(intake.problem, start, start_noise(intake.problem.settings, driven=True))
     found = learn_range_noise(optimum)
     range_m = np.linalg.norm(intake.problem.measured[:, :3], axis=1)
     many = found[np.argmax(range_m), 1] / found[np.argmin(range_m), 1]

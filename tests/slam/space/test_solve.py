@@ -14,7 +14,7 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.slam.space.estimate import converged
+from evermap.slam.space.estimate import converge
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.solve import solve_space
@@ -127,7 +127,7 @@ def test_a_wrong_identity_alone_in_view_is_no_place_of_the_robot():
     sensed = se3.compose(optimum.estimate.mount(problem)[problem.sensor[row]], problem.measured[row])
     pose = true.copy()
     pose[middle] = se3.compose(optimum.estimate.place[problem.place[row]], se3.inverse(sensed))
-    astray = converged(problem, replace(optimum.estimate, pose=pose), optimum.noise, heavy_rounds=0)
+    astray = converge(problem, replace(optimum.estimate, pose=pose), optimum.noise, heavy_rounds=0)
     assert np.linalg.norm(astray.estimate.pose[middle, :3] - true[middle, :3]) > 1.0
     assert (astray.now.odometry_weight < 0.5).sum() == 2
     found = repaired(astray)

@@ -11,12 +11,12 @@ from evermap.config import Config
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.slam.space import starts
-from evermap.slam.space.estimate import converged, first_places
+from evermap.slam.space.estimate import converge, first_places
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.solve import SpatialSolved, _or_best, solve_space
-from evermap.slam.space.starts import by_constellations, located_again
+from evermap.slam.space.starts import by_constellations, locate_again
 from evermap.types import FloatArray, SpatialRecording
 
 from .rigs import Rig
@@ -39,7 +39,7 @@ def from_the_truth(recording: SpatialRecording, intake: SpatialIntake) -> FloatA
     if survey.rotation is not None:
         start.place[:, 3:] = survey.rotation[intake.landmark_id]
     goes = (settings.drift_m, settings.drift_rad) if problem.driven else (settings.hand_mps, settings.hand_radps)
-    return converged(problem, start, SpatialNoise(*goes)).estimate.pose
+    return converge(problem, start, SpatialNoise(*goes)).estimate.pose
 
 
 def error(pose: FloatArray, true: FloatArray) -> float:
@@ -103,7 +103,7 @@ def test_frames_that_reject_what_they_see_are_located_again():
     pose[lost] = se3.retract(true[lost], np.array([0.0, 0.0, 0.0, 0.0, np.radians(25.0), 0.0]))
     estimate = SpatialEstimate(pose, place, np.zeros((1, 7)))
     weight = np.where(lost[problem.pose_row], 0.0, 1.0)
-    found = located_again(problem, SpatialNoise(0.03, 0.015), estimate, weight)
+    found = locate_again(problem, SpatialNoise(0.03, 0.015), estimate, weight)
     assert found is not None
     assert np.array_equal(found.pose[~lost], pose[~lost])
     seen = lost & (np.bincount(problem.pose_row, minlength=len(true)) >= 3)
@@ -133,7 +133,7 @@ def from_one_turned(seed: int, tag: int):
     start = first_places(problem, true_poses(world.recording, intake))
     start.place[:, :3] = world.tags.position_m[intake.landmark_id]
     start.place[:, 3:] = world.tags.rotation[intake.landmark_id]
-    right = converged(problem, start, starts_noise(problem))
+    right = converge(problem, start, starts_noise(problem))
     mine = np.flatnonzero(problem.place == tag)
     seen_from = se3.compose(right.estimate.pose[problem.pose_row[mine]], problem.mount[0])
     both = se3.compose(seen_from, problem.either[:, mine])
@@ -141,7 +141,7 @@ def from_one_turned(seed: int, tag: int):
     other = both[np.argmax(off, axis=0), np.arange(len(mine))]
     turned = right.estimate.place.copy()
     turned[tag, 3:] = other[len(mine) // 2, 3:]
-    wrong = converged(problem, SpatialEstimate(right.estimate.pose, turned, right.estimate.state), right.noise)
+    wrong = converge(problem, SpatialEstimate(right.estimate.pose, turned, right.estimate.state), right.noise)
     return right, wrong
 
 

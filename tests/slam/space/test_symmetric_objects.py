@@ -77,7 +77,7 @@ def test_what_nobody_sees_is_unknown_and_all_else_as_sure_as_it_says() -> None:
             assert own[~seen][:, ~seen] == pytest.approx(np.pi**2 / 3.0 * np.eye(3)[~seen][:, ~seen])
             assert own[~seen][:, seen] == pytest.approx(0.0, abs=1e-9)
             if kind != "mug":
-                alike = Symmetry.generated(SYMMETRIES[kind])
+                alike = Symmetry.generate_group(SYMMETRIES[kind])
                 true = alike.nearest(*(np.append(np.zeros(3), q) for q in (turn[name].as_quat(), marks.rotation[k])))
                 off = se3.local(np.append(np.zeros(3), marks.rotation[k]), true)[3:][seen]
                 squared.append(off @ np.linalg.solve(own[np.ix_(seen, seen)], off))

@@ -11,7 +11,7 @@ from evermap import Config, run_slam, run_together
 from evermap.config import LocalizeConfig
 from evermap.errors import DataError, InputError
 from evermap.estimate.gauss_newton import Steps
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se3
 from evermap.maps.sessions.spatial import solve_visit
 from evermap.metrics.summary import compare_with_truth
@@ -72,7 +72,7 @@ def test_covariances_are_those_of_a_dense_inverse():
     visits = [solve_visit(one, Config(), None, ()) for one in recordings]
     members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
     joint, start = _lay_together(members, align_robots(members, ["a", "b"], LocalizeConfig()))
-    solution = exhausted(joint.minimised_in_slices(start, Steps(10, 1e-5)))
+    solution = exhaust(joint.minimise_in_slices(start, Steps(10, 1e-5)))
     graph, values = joint.graph(solution.state), solution.now.values
     system, variable = graph.structure.system, joint.variables(np.ones(len(start.place), dtype=np.bool_))
     size = int(system.tree.begin[-1])
@@ -98,7 +98,7 @@ def test_covariances_are_those_of_a_dense_inverse():
         at = np.concatenate([system.tree.begin[k] + np.arange(system.tree.dim[k]) for k in states])
         found = part.smoother.factorised(part.now).border_covariance()
         np.testing.assert_allclose(found, covariance[np.ix_(at, at)], atol=1e-6 * np.abs(found).max())
-    assert exhausted(system.factorised(values, extra=graph.held)) is not None
+    assert exhaust(system.factorised(values, extra=graph.held)) is not None
 
 
 def test_robots_without_a_common_landmark_are_not_laid_together():

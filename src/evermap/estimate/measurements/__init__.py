@@ -20,7 +20,7 @@ _ADDED: dict[str, MeasurementKind] = {}
 
 def find_kinds() -> Mapping[str, MeasurementKind]:
     """Return all kinds of measurements by their names."""
-    return {**_installed_kinds(), **_ADDED}
+    return {**_list_installed_kinds(), **_ADDED}
 
 
 def add_kind(kind: MeasurementKind) -> None:
@@ -35,7 +35,7 @@ def add_kind(kind: MeasurementKind) -> None:
 
 
 @functools.cache
-def _installed_kinds() -> Mapping[str, MeasurementKind]:
+def _list_installed_kinds() -> Mapping[str, MeasurementKind]:
     names = sorted(module.name for module in pkgutil.iter_modules(__path__))
     kinds = [importlib.import_module(f"{__name__}.{name}").KIND for name in names]
     kinds += [point.load() for point in entry_points(group="evermap.measurements")]

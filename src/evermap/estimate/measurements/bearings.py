@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stack_columns
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -16,7 +16,9 @@ def linearise(pose: FloatArray, place: FloatArray, columns: Columns) -> Linearis
     x, y, z = seen.T
     flat = np.maximum(np.hypot(x, y), 1e-6)
     far = np.maximum(np.linalg.norm(seen, axis=1), 1e-6)
-    off = stacked(columns, "azimuth_rad", "elevation_rad") - np.column_stack([np.arctan2(y, x), np.arctan2(z, flat)])
+    off = stack_columns(columns, "azimuth_rad", "elevation_rad") - np.column_stack(
+        [np.arctan2(y, x), np.arctan2(z, flat)]
+    )
     by_seen = np.stack(
         [
             np.column_stack([-y, x, 0.0 * z]) / flat[:, None] ** 2,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Linearised, MeasurementKind, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, stack_columns
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
 
 def linearise(pose: FloatArray, other: FloatArray, columns: Columns) -> Linearised:
     """Return the twist from the predicted to the measured pose of the later instant, seen from the earlier one."""
-    given = stacked(columns, "x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
+    given = stack_columns(columns, "x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
     known = np.nan_to_num(given)
     measured = np.hstack([known[:, :3], se3.from_angles(known[:, 3:])[:, 3:]])
     between = se3.between(pose, other)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stack_columns
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
@@ -17,7 +17,7 @@ def linearise(pose: FloatArray, _: FloatArray, columns: Columns) -> Linearised:
     by_pose = np.zeros((len(pose), 3, 6))
     by_pose[:, 0, :3] = -up  # a step in the robot's frame rises by its part along the vertical
     by_pose[:, 1:, 3:] = -crossing(up)[:, :2]
-    return Linearised(stacked(columns, "z_m", "up_x", "up_y") - predicted, by_pose)
+    return Linearised(stack_columns(columns, "z_m", "up_x", "up_y") - predicted, by_pose)
 
 
 KIND = MeasurementKind(

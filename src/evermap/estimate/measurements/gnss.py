@@ -14,7 +14,7 @@ from evermap.estimate.kind import (
     Messages,
     TableRows,
     crossing,
-    stacked,
+    stack_columns,
 )
 from evermap.geometry import se2, se3
 from evermap.geometry.rigid import rigid
@@ -26,16 +26,16 @@ EARTH_RADIUS_M, EARTH_ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
 
 def linearise(pose: FloatArray, _: FloatArray, columns: Columns) -> Linearised:
     """Return fix less antenna."""
-    lever = stacked(columns, "lever_x_m", "lever_y_m", "lever_z_m")
-    fix, turn = stacked(columns, "x_m", "y_m", "z_m"), se3.rotation_of(pose)
+    lever = stack_columns(columns, "lever_x_m", "lever_y_m", "lever_z_m")
+    fix, turn = stack_columns(columns, "x_m", "y_m", "z_m"), se3.rotation_of(pose)
     by_pose = -np.concatenate([turn, -turn @ crossing(lever)], axis=2)
     return Linearised(fix - se3.transform(pose, lever), by_pose)
 
 
 def find_frame(pose: FloatArray, columns: Columns) -> FloatArray:
     """Return the turn about the vertical and the shift that bring the antenna nearest to most fixes."""
-    antenna = se3.transform(pose, stacked(columns, "lever_x_m", "lever_y_m", "lever_z_m"))
-    fix, weight = stacked(columns, "x_m", "y_m"), np.ones(len(pose))
+    antenna = se3.transform(pose, stack_columns(columns, "lever_x_m", "lever_y_m", "lever_z_m"))
+    fix, weight = stack_columns(columns, "x_m", "y_m"), np.ones(len(pose))
     for _ in range(10):
         motion = rigid(antenna[:, :2], fix, weight)
         away = np.linalg.norm(se2.transform(motion, antenna[:, :2]) - fix, axis=1)

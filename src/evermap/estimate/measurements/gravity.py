@@ -14,7 +14,7 @@ from evermap.estimate.kind import (
     Messages,
     TableRows,
     crossing,
-    stacked,
+    stack_columns,
 )
 from evermap.geometry import se3
 from evermap.types import FloatArray, SpatialOdometry
@@ -35,7 +35,7 @@ STEADY_MPS2 = 0.3
 
 def linearise(pose: FloatArray, _: FloatArray, columns: Columns) -> Linearised:
     """Return the measured direction less that of the vertical in the robot's frame: at rest it reads upward."""
-    reads = stacked(columns, "ax_mps2", "ay_mps2", "az_mps2")
+    reads = stack_columns(columns, "ax_mps2", "ay_mps2", "az_mps2")
     up = se3.rotation_of(pose)[:, 2]
     by_pose = np.concatenate([np.zeros((len(pose), 3, 3)), -crossing(up)], axis=2)
     return Linearised(reads / np.linalg.norm(reads, axis=1, keepdims=True) - up, by_pose)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stacked
+from evermap.estimate.kind import Columns, Linearised, MeasurementKind, crossing, stack_columns
 from evermap.geometry import se3
 from evermap.types import FloatArray
 
 
 def linearise(pose: FloatArray, place: FloatArray, columns: Columns) -> Linearised:
     """Return ranges from a radio on the robot, measured less predicted."""
-    lever, turn = stacked(columns, "lever_x_m", "lever_y_m", "lever_z_m"), se3.rotation_of(pose)
+    lever, turn = stack_columns(columns, "lever_x_m", "lever_y_m", "lever_z_m"), se3.rotation_of(pose)
     away = place - se3.transform(pose, lever)
     far = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
     by_place = -(away / far[:, None])[:, None]
@@ -21,7 +21,7 @@ def linearise(pose: FloatArray, place: FloatArray, columns: Columns) -> Linearis
 
 def locate(pose: FloatArray, columns: Columns) -> FloatArray | None:
     """Return (3,) where ranges cross; where the robot moved in a plane, above it. None where it moved along a line."""
-    radio = se3.transform(pose, stacked(columns, "lever_x_m", "lever_y_m", "lever_z_m"))
+    radio = se3.transform(pose, stack_columns(columns, "lever_x_m", "lever_y_m", "lever_z_m"))
     middle, far = radio.mean(axis=0), columns["range_m"]
     axes = np.linalg.svd(radio - middle, full_matrices=True)[2]
     at = (radio - middle) @ axes.T

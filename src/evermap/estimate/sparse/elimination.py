@@ -113,7 +113,7 @@ def _of_factor(tree: Tree, factors: Factors, f: int, index: Any) -> int:
 
 
 @kernel
-def _passed_on(tree: Tree, node: int, index: Any) -> int:
+def _pass_on(tree: Tree, node: int, index: Any) -> int:
     """Write the positions of a front's passed-on numbers in its parent's; return their count."""
     left = 0
     for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
@@ -200,7 +200,7 @@ def _gather(
     while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
         n_waiting -= 1
         child = whose[n_waiting]
-        left = _passed_on(tree, child, index)
+        left = _pass_on(tree, child, index)
         _add_passed_on(waiting, where[n_waiting], left, index, front, size)
     state.n_waiting[0] = n_waiting
 
@@ -459,7 +459,7 @@ def spread(
     for node in range(low, high):
         size, own = tree.size[node], tree.own[node]
         cov = held[way[node] : way[node] + size * size].reshape(size, size)
-        left = _passed_on(tree, node, index)
+        left = _pass_on(tree, node, index)
         if node > 0:
             up = tree.parent[node]
             above = held[way[up] : way[up] + tree.size[up] ** 2].reshape(tree.size[up], tree.size[up])

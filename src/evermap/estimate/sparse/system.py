@@ -42,7 +42,7 @@ LARGE = 1e7
 
 
 class _AtOnce(threading.local):
-    """How many `exhausted` a thread is within."""
+    """How many `exhaust` a thread is within."""
 
     depth = 0
 
@@ -50,7 +50,7 @@ class _AtOnce(threading.local):
 _AT_ONCE = _AtOnce()
 
 
-def exhausted(slices: Slices[_Result]) -> _Result:
+def exhaust(slices: Slices[_Result]) -> _Result:
     """Return the result of work that is done at once, in as few slices as it can be."""
     _AT_ONCE.depth += 1
     try:
@@ -210,7 +210,7 @@ class System:
         self, dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray, tree: Tree | None = None
     ) -> None:
         self.factors = factors
-        self.tree: Tree = exhausted(tree_of(dim, factors, coordinate, border)) if tree is None else tree
+        self.tree: Tree = exhaust(tree_of(dim, factors, coordinate, border)) if tree is None else tree
         size_gb = 8e-9 * (self.tree.stored[-1] + self.tree.most_waiting)
         if size_gb > MEMORY_LIMIT_GB:
             problem = f"{len(dim)} poses and landmarks tied by {len(factors.rows)} measurements need {size_gb:.0f} GB"

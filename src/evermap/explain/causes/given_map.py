@@ -103,7 +103,7 @@ def _name_order(quaternion: FloatArray) -> str:
 
 
 _AXES_TURNED = sorted(
-    (each for each in Symmetry.generated(("90:x", "90:z")).turns if abs(each[3]) < 1.0 - 1e-9),
+    (each for each in Symmetry.generate_group(("90:x", "90:z")).turns if abs(each[3]) < 1.0 - 1e-9),
     key=lambda each: bool(each[:2].any()),
 )
 """Quaternions of the 23 rotations that bring axes to axes, those about the normal of a tag first."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from evermap.config import BoxesConfig
-from evermap.maps.bodies import squared_length
+from evermap.maps.bodies import square_lengths
 from evermap.maps.sessions.box_search import MapBoxes, half_turn
 from evermap.maps.sessions.box_visit import SeenBoxes
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -113,7 +113,7 @@ class BoxLikeness:
     def log_likelihoods(self, pairs: BoxPairs) -> tuple[FloatArray, FloatArray]:
         """Return (K, M) log likelihoods that a box of the session is one of the map, and that it is another one."""
         settings, spread = self.settings, pairs.spread_m2
-        squared = squared_length(pairs.off_m, spread)
+        squared = square_lengths(pairs.off_m, spread)
         tails = (1.0 - settings.far_share, 1.0), (settings.far_share, settings.far_factor)
         near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in tails)
         same = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi)

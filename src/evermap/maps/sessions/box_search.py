@@ -19,7 +19,7 @@ from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.box_visit import SeenBoxes
-from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap, list_agreed_pairs
 from evermap.slam.association.identify import ALL_TRIED
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.tracking.frame import heading_of
@@ -86,7 +86,7 @@ def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray
         return None
     every, sized = np.ones(len(known.place), dtype=np.bool_), np.flatnonzero(np.isfinite(seen.size_m[:, 0]))
     windows = _windows(sized, seen, WINDOWS[0])
-    best = max((_agreed(seen, known, some, every, np.zeros(3)) for some in windows), key=len, default=[])
+    best = max((_list_agreeing(seen, known, some, every, np.zeros(3)) for some in windows), key=len, default=[])
     settings = known.settings
     if len(best) < settings.shared_pairs:
         best = _searched(seen, known, windows, (1.0,) if metre else FACTORS)
@@ -106,7 +106,7 @@ def _searched(
     for factor in factors:
         scaled = replace(seen, position_m=factor * seen.position_m)
         for some in windows:
-            best = max(best, _agreed(scaled, known, some, every), key=len)
+            best = max(best, _list_agreeing(scaled, known, some, every), key=len)
             if len(best) >= known.settings.enough_pairs:
                 return best
         if len(best) >= known.settings.found_pairs:
@@ -122,7 +122,7 @@ def _factor(own_m: FloatArray, there_m: FloatArray, settings: BoxesConfig) -> fl
     return factor if abs(factor - 1.0) * spread_m > settings.metre_sigmas * math.sqrt(2.0) * settings.drift_m else 1.0
 
 
-def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
+def regain(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
     """Return matching rows of boxes of a session, in the map as far as it is known, and of the map, by their
     constellation.
 
@@ -133,7 +133,7 @@ def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArra
     for some in [window for size in WINDOWS for window in _windows(left, seen, size)]:
         free = ~np.isin(known.place, place)
         away = np.linalg.norm(known.position_m[:, None, :2] - seen.position_m[some, :2], axis=2).min(axis=1)
-        pairs = _agreed(seen, known, some, free & (away < known.settings.near_m))
+        pairs = _list_agreeing(seen, known, some, free & (away < known.settings.near_m))
         if len(pairs) < known.settings.found_pairs:
             continue
         mine, theirs = (np.array(part) for part in zip(*pairs, strict=True))
@@ -155,7 +155,7 @@ def windows(rows: IntArray, size: int) -> list[IntArray]:
     return [rows[k : k + size] for k in range(0, max(len(rows) - size // 2, 1), size // 2)]
 
 
-def _agreed(
+def _list_agreeing(
     seen: SeenBoxes, known: MapBoxes, some: IntArray, among: BoolArray, motion: FloatArray | None = None
 ) -> list[tuple[int, int]]:
     """Pairs of some boxes of a session with some of the map that are certain; by any motion, or by one that is given.
@@ -173,7 +173,7 @@ def _agreed(
         index = PlaceIndex(at, _floor(known.covariance_m2[row], settings.drift_m), settings=known.slam)
         motions = list(index.motions(source.place, sigma_m))
     anywhere_nats = known.slam.association.constellation.certain_nats + max(math.log(area_m2 / TESTED_M2), 0.0)
-    found = agreed_pairs(
+    found = list_agreed_pairs(
         source,
         LocalMap(at, block_diag(*_floor(known.covariance_m2[row], settings.drift_m))),
         _alike(seen, known)[np.ix_(some, row)],

@@ -51,7 +51,7 @@ class SeenBoxes:
     p_stay: FloatArray
 
 
-def seen_boxes(taken: TrafficIntake, solved: SpatialSolved, settings: BoxesConfig) -> SeenBoxes:
+def list_boxes(taken: TrafficIntake, solved: SpatialSolved, settings: BoxesConfig) -> SeenBoxes:
     """Return the static boxes of a session at their estimated places."""
     optimum, stands = solved.optimum, taken.stays
     problem, estimate, count = optimum.smoother.problem, optimum.estimate, len(optimum.estimate.place)
@@ -179,7 +179,7 @@ class BoxVisit(SpatialVisit):
         rows, at = self._detected()
         of = recording.detections.frame[rows]
         looks = frame[listed.pose] * len(entry.living.places) + listed.landmark
-        glimpsed = self._glimpsed(entry, looks, rows, at, settings) & ~listed.hit
+        glimpsed = self._list_glimpses(entry, looks, rows, at, settings) & ~listed.hit
         often = np.bincount(listed.landmark[glimpsed], minlength=len(entry.living.places)) >= settings.fewest_glimpses
         hit = listed.hit | (glimpsed & often[listed.landmark])
         shown = hit | ~glimpsed  # one alone may be a wrong box
@@ -194,7 +194,7 @@ class BoxVisit(SpatialVisit):
             if len(mine) and len(other):
                 eye, far = watch.eye[view, :2], settings.behind_m
                 box, half_m = at[other, :2] - eye, settings.covered * length[other]
-                shown[mine] &= ~_hidden_by(place[listed.landmark[mine]] - eye, box, half_m, far)
+                shown[mine] &= ~_is_hidden_by(place[listed.landmark[mine]] - eye, box, half_m, far)
         if len(self.tied_m):
             away = np.linalg.norm(watch.eye[:, None, :2] - self.tied_m, axis=2).min(axis=1)
             shown &= hit | (away <= settings.tied_m)[listed.pose]
@@ -226,7 +226,7 @@ class BoxVisit(SpatialVisit):
         eye = se3.compose(self.path[row_of[recording.detections.frame[rows]]], mounts_of(recording)[rows])
         return rows, se3.transform(eye, seen)
 
-    def _glimpsed(
+    def _list_glimpses(
         self, entry: Extended, looks: IntArray, rows: IntArray, at: FloatArray, settings: BoxesConfig
     ) -> BoolArray:
         """Looks, by frame and place, at boxes of the map that a detection shows which no stay has."""
@@ -246,7 +246,7 @@ class BoxVisit(SpatialVisit):
         return np.isin(looks, recording.detections.frame[rows[here]] * len(living.places) + box[nearest[here]])
 
 
-def _hidden_by(place: FloatArray, box: FloatArray, half_m: FloatArray, behind_m: float) -> BoolArray:
+def _is_hidden_by(place: FloatArray, box: FloatArray, half_m: FloatArray, behind_m: float) -> BoolArray:
     """(P,) whether places (P, 2) are behind any of some boxes (B, 2), as seen from the origin."""
     range_m, near_m = np.linalg.norm(place, axis=1), np.maximum(np.linalg.norm(box, axis=1), 0.1)
     along = place / np.maximum(range_m, 0.1)[:, None]

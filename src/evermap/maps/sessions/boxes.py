@@ -23,18 +23,18 @@ from evermap.config import BoxesConfig, Config
 from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
-from evermap.maps.bodies import squared_length
+from evermap.maps.bodies import square_lengths
 from evermap.maps.living import LivingMap
 from evermap.maps.names import anonymous_text, distinct_text
 from evermap.maps.sessions.believe import Witnessed, aged
 from evermap.maps.sessions.box_likeness import BoxLikeness, BoxPairs, learn_likeness
-from evermap.maps.sessions.box_search import GATE, MapBoxes, in_space, placed, regained
-from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, seen_boxes
+from evermap.maps.sessions.box_search import GATE, MapBoxes, in_space, placed, regain
+from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, list_boxes
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, one_to_one, widened
-from evermap.maps.sessions.spatial import SpatialVisit, localised_in_space
+from evermap.maps.sessions.spatial import SpatialVisit, localise_in_space
 from evermap.maps.vicinity import cliques_of
-from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.moving import TrafficIntake, has_traffic, rescaled, solve_in_traffic, take_in_traffic
+from evermap.slam.space.estimate import SpatialOptimum, converge
+from evermap.slam.space.moving import TrafficIntake, has_traffic, rescale, solve_in_traffic, take_in_traffic
 from evermap.slam.space.problem import PlacePrior
 from evermap.slam.space.result import identities_of
 from evermap.slam.space.solve import FREE, SpatialSolved
@@ -58,22 +58,22 @@ def localised(
 ) -> Localised[SpatialVisit]:
     """Return a session in space where it lies in a map; boxes without identity get theirs from the map.
 
-    Arguments are those of `spatial.localised_in_space`.
+    Arguments are those of `spatial.localise_in_space`.
     """
     if not has_traffic(recording):
-        return localised_in_space(recording, living, config, remarks, progress)
+        return localise_in_space(recording, living, config, remarks, progress)
     settings, taken = config.living, take_in_traffic(recording, config.slam.space, config.track)
     p_site = aged(living, settings, float(taken.recording.frames.stamp_s[0])).p_here
     solved, known = _by_itself(taken, progress, settings.boxes), MapBoxes.of(living, p_site, config)
     found = _placed(taken, solved, living, known) if len(living.places) else None
     if found is not None and found[1] != 1.0:
-        taken = rescaled(taken, found[1])
+        taken = rescale(taken, found[1])
         solved = _by_itself(taken, None, settings.boxes)
         found = _placed(taken, solved, living, known)
     held = None
     if found is not None:
         with suppress(NumericalError):  # what was held contradicts itself
-            held = _settled(taken, replace(solved, optimum=_moved(solved.optimum, found[0])), living, known)
+            held = _settle(taken, replace(solved, optimum=_moved(solved.optimum, found[0])), living, known)
     if held is None or not _agrees(taken, *held, living, known):
         alone: SpatialVisit = _visit(taken, solved, _Matched.nothing(solved), living, config)
         return Localised.lost(alone, living, NOT_FOUND) if len(living.places) else Localised(alone, alone.named(living))
@@ -119,7 +119,7 @@ def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living
     if len(_named(taken, held, living)[0]) > 1:
         return True
     settings = known.settings
-    seen = seen_boxes(taken, held, settings)
+    seen = list_boxes(taken, held, settings)
     there = matched.place[seen.place] >= 0
     off = seen.position_m[:, None, :2] - known.position_m[known.p >= settings.perhaps, :2]
     away = np.linalg.norm(off, axis=2).min(axis=1, initial=np.inf)
@@ -148,12 +148,12 @@ def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
     place = se3.compose(motion, estimate.place)
     place[~oriented, 3:] = se3.NO_TURN
     estimate = replace(estimate, pose=se3.compose(motion, estimate.pose), place=place)
-    return converged(optimum.smoother.problem, estimate, optimum.noise, heavy_rounds=0)
+    return converge(optimum.smoother.problem, estimate, optimum.noise, heavy_rounds=0)
 
 
 def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, settings: BoxesConfig) -> SpatialSolved:
     """Merge places of a session: those with one `label` (P,), and overlapping boxes."""
-    seen, count = seen_boxes(taken, solved, settings), len(label)
+    seen, count = list_boxes(taken, solved, settings), len(label)
     first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1].ravel()]
     i, j = _same(seen, settings)
     one, other = np.concatenate([np.arange(count), seen.place[i]]), np.concatenate([first, seen.place[j]])
@@ -179,7 +179,7 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
         symmetries=problem.symmetries[head],
         prior=prior,
     )
-    optimum = converged(problem, replace(estimate, place=place), solved.optimum.noise, heavy_rounds=0)
+    optimum = converge(problem, replace(estimate, place=place), solved.optimum.noise, heavy_rounds=0)
     return replace(
         solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head],
         moves=tuple(one._replace(before=int(part[one.before]), after=int(part[one.after])) for one in solved.moves),
@@ -221,10 +221,10 @@ def _placed(
         if named:
             return in_space(named.motion, own[named.agree], there[named.agree]), 1.0
     metre = taken.known > 0 or taken.gauge.stated is not None
-    return placed(seen_boxes(taken, solved, known.settings), known, metre=metre)
+    return placed(list_boxes(taken, solved, known.settings), known, metre=metre)
 
 
-def _settled(
+def _settle(
     taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes
 ) -> tuple[SpatialSolved, _Matched]:
     """Solve the session constrained by matching boxes of the map, until the matches no longer change.
@@ -239,8 +239,8 @@ def _settled(
         settled = np.array_equal(following.place, matched.place)
         solved, matched = held, following
         if settled:
-            seen = seen_boxes(taken, solved, known.settings)
-            mine, theirs = regained(seen, known, matched.place[seen.place])
+            seen = list_boxes(taken, solved, known.settings)
+            mine, theirs = regain(seen, known, matched.place[seen.place])
             count = int(np.count_nonzero(matched.place >= 0))
             if not len(mine) or count <= most:  # what was regained last did not hold
                 break
@@ -272,7 +272,7 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings:
         if translation <= noise.translation and translation > 0.0:
             continue
         noise = replace(noise, translation=max(translation, noise.translation), rotation=max(rotation, noise.rotation))
-        found = converged(problem, optimum.estimate, noise, heavy_rounds=0)
+        found = converge(problem, optimum.estimate, noise, heavy_rounds=0)
         off = ((found.estimate.place[row, :2] - pose[:, :2]) / sigma[:, :2]) ** 2
         if (
             max((float(off[k : k + STRETCH].mean()) for k in range(0, len(off), STRETCH)), default=0.0)
@@ -287,7 +287,7 @@ def _matched(
 ) -> _Matched:
     """Match boxes to the map, one to one but for parts of a track; gates grow with the distance to (H, 2)."""
     settings = known.settings
-    seen, count = seen_boxes(taken, solved, settings), len(solved.identity)
+    seen, count = list_boxes(taken, solved, settings), len(solved.identity)
     found = _Matched.nothing(solved)
     row, place = _named(taken, solved, living)
     near = np.linalg.norm(solved.optimum.estimate.place[row, :3] - living.places.position_m[place], axis=1)
@@ -314,7 +314,7 @@ def _matched(
     found.place[seen.place[some]] = known.place[chosen[some]]
     found.probability[seen.place[some]] = np.exp(odds[some, chosen[some]] - total)
     members, places = living.members, living.places
-    told = living.told_site()[np.searchsorted(members.landmark_id, known.landmark_id)]
+    told = living.find_current_site()[np.searchsorted(members.landmark_id, known.landmark_id)]
     free = (told == places.site_id[known.place]) & ~np.isin(np.arange(len(known.place)), chosen)
     _find_replaced(found, seen, known, like.log_odds(pairs), pairs, chosen, free)
     assert len(found.place) == count
@@ -344,7 +344,7 @@ def _find_replaced(
 
 def _log_odds(like: BoxLikeness, pairs: BoxPairs) -> FloatArray:
     """Return (K, M) log odds that a box of the session is one of the map, against being new; -inf beyond gates."""
-    near = squared_length(pairs.off_m, pairs.spread_m2) < GATE * like.settings.far_factor**2
+    near = square_lengths(pairs.off_m, pairs.spread_m2) < GATE * like.settings.far_factor**2
     return np.where(near & pairs.alike, like.log_odds(pairs), -np.inf)
 
 
@@ -353,7 +353,7 @@ def _visit(
 ) -> BoxVisit:
     """Return the session with ids of the map for matched boxes, and new ones for the others."""
     settings = config.living.boxes
-    seen = seen_boxes(taken, solved, settings)
+    seen = list_boxes(taken, solved, settings)
     identity, names = identities_of(taken.intake, solved)
     kept = np.ones(len(identity), dtype=np.bool_)
     start_s = float(taken.recording.frames.stamp_s[0])

@@ -56,7 +56,7 @@ def decided(
         if session.missed[row] and not session.was_hit[row]:  # the more probably hidden, the more it stands there
             hidden[session.sight[row]] += looks.share[row] * (1.0 - session.p_away[row])
         if clique in told:
-            session.told_before(row, *told[clique])
+            session.decide_before(row, *told[clique])
         else:
             session.was_away(row)
     hidden[2], shown[2] = looks.unwitnessed
@@ -135,7 +135,7 @@ def join_replaced(
         return changes
     names, at_m = entry.landmark_id[new], living.places.position_m[entry.place[new]]
     old = np.array([changes[k].landmark_ids[0] for k in left])
-    site = before.told_site()[np.searchsorted(before.members.landmark_id, old)]
+    site = before.find_current_site()[np.searchsorted(before.members.landmark_id, old)]
     was_m = living.places.position_m[living.place_row(old, site)]
     away_m = np.linalg.norm(was_m[:, None] - at_m, axis=2)
     told, joined = list(changes), list[MapChange]()
@@ -258,7 +258,7 @@ class _Session:
         self.begun: list[tuple[int, int, float, float, float, float, float]] = []
         self.found: list[MapChange] = []
 
-    def told_before(self, row: int, old: int, stay: int) -> None:
+    def decide_before(self, row: int, old: int, stay: int) -> None:
         """Decide on a clique that occupied the site `old`, by the stay `stay` (-1 for none)."""
         site = int(self.site[row])
         if self.stands[row] and site == old:
@@ -271,7 +271,7 @@ class _Session:
             and self.log_evidence[row] <= -self.least[row]
             and self.p_away[row] >= EXISTS
         ):
-            self._vanished(row, old, stay)
+            self._report_vanished(row, old, stay)
         elif stay >= 0 and self.missed[row]:
             self.p_gone[stay] = self.p_away[row]
 
@@ -342,7 +342,7 @@ class _Session:
             n_hits, n_misses = int(self.hits[site]), self._n_missed(old)
             self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
 
-    def _vanished(self, row: int, old: int, stay: int) -> None:
+    def _report_vanished(self, row: int, old: int, stay: int) -> None:
         p_away = float(self.p_away[row])
         left_s = self._ends(old, stay, p_away)
         to_s = _first_miss(self.looks, old, left_s, self.start_s)
@@ -443,7 +443,7 @@ def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConf
     rank = np.arange(len(order)) - np.searchsorted(sites.clique_id[order], sites.clique_id[order])
     kept = np.zeros(len(sites), dtype=np.bool_)
     kept[order[rank < most_sites]] = True
-    gone = _gone_for_good(living, settings)
+    gone = _list_gone_for_good(living, settings)
     kept &= ~np.isin(sites.clique_id, gone)
     stays = living.stays
     if len(stays) > settings.most_stays:
@@ -461,7 +461,7 @@ def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConf
     )
 
 
-def _gone_for_good(living: LivingMap, settings: DecisionConfig) -> IntArray:
+def _list_gone_for_good(living: LivingMap, settings: DecisionConfig) -> IntArray:
     """Ids of cliques that are away and need not be remembered."""
     sites = living.sites
     cliques, row = clique_rows(sites)

@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.config import LivingConfig
 from evermap.geometry.chunked import JointCovariance, blocks, of_places, taken
-from evermap.maps.bodies import Displacements, Fate, group, regrouped, relabelled
+from evermap.maps.bodies import Displacements, Fate, group, regroup, relabel
 from evermap.maps.living import LivingMap, Members, Places, Sites, rows_among
 from evermap.maps.sessions.gaussian import with_session
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -142,7 +142,7 @@ def extended(living: LivingMap, aged: Sites, found: Found, config: LivingConfig,
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
     places = replace(places, position_m=position)
     if found.rotation is not None and found.rotation_covariance is not None:
-        turn = _turned(places, found.place, found.rotation, found.rotation_covariance)
+        turn = _average_turns(places, found.place, found.rotation, found.rotation_covariance)
         places = replace(places, rotation=turn[0], rotation_covariance=turn[1])
     sites, p_start, is_new = _with_sites(living, aged, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
     sorted_rows = np.lexsort((places.landmark_id, places.site_id))
@@ -166,7 +166,7 @@ def extended(living: LivingMap, aged: Sites, found: Found, config: LivingConfig,
     )
 
 
-def _turned(
+def _average_turns(
     places: Places, place: IntArray, rotation: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Orientations of places, and their covariances, with those of a session's landmarks (K,): at their `place`, of new
@@ -189,8 +189,8 @@ def _with_bodies(
     clique_id = _bodies(living, aged.p_here, found, config, drift_m)
     if np.array_equal(clique_id, living.members.clique_id):
         return living, living, aged, found
-    before = relabelled(living, clique_id)[0]
-    living, moved_to = relabelled(replace(living, sites=aged), clique_id)
+    before = relabel(living, clique_id)[0]
+    living, moved_to = relabel(replace(living, sites=aged), clique_id)
     if not np.array_equal(before.sites.site_id, living.sites.site_id):  # united under another of their sites
         before = living
     found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
@@ -205,7 +205,7 @@ def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tupl
     if not len(new):
         return members, living.n_cliques_ever
     if config.cliques:
-        clique = living.n_cliques_ever + _numbered(found.object_id[new], found, new, config.clique_reach_m)
+        clique = living.n_cliques_ever + _number_bodies(found.object_id[new], found, new, config.clique_reach_m)
         _join_known(clique, new, members, found, config.clique_reach_m)
     else:
         clique = living.n_cliques_ever + np.arange(len(new))
@@ -214,7 +214,7 @@ def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tupl
     return both[np.argsort(both.landmark_id, kind="stable")], int(clique.max(initial=living.n_cliques_ever - 1)) + 1
 
 
-def _numbered(object_id: IntArray, found: Found, new: IntArray, reach_m: float) -> IntArray:
+def _number_bodies(object_id: IntArray, found: Found, new: IntArray, reach_m: float) -> IntArray:
     """Bodies of new landmarks, from 0: by the detector of objects where it says something, else by proximity."""
     number = np.zeros(len(new), dtype=np.int64)
     told = object_id >= 0
@@ -266,14 +266,14 @@ def _bodies(living: LivingMap, p_site: FloatArray, found: Found, config: LivingC
     fate = np.full(len(members), Fate.UNSEEN, dtype=np.int64)
     fate[member] = np.where(found.place[row] == stood[member], Fate.STAYED, Fate.MOVED)
     if not (fate == Fate.MOVED).any():
-        return _torn(living, p_site, members.clique_id, found, config.clique_reach_m)
+        return _tear_cliques(living, p_site, members.clique_id, found, config.clique_reach_m)
     before = places.position_m[np.maximum(stood, 0)]
     after, spread = before.copy(), np.zeros((len(members), living.dim, living.dim))
     after[member] = found.position_m[row]
     now, then = (blocks(covariance, living.dim) for covariance in (found.covariance_m2, living.covariance_m2))
     spread[member] = now[row] + then[stood[member]]
     spread += drift_m**2 * np.eye(living.dim)
-    clique_id = regrouped(
+    clique_id = regroup(
         members.clique_id,
         members.class_id,
         fate,
@@ -282,10 +282,10 @@ def _bodies(living: LivingMap, p_site: FloatArray, found: Found, config: LivingC
         next_id=living.n_cliques_ever,
         settings=config.grouping,
     )
-    return _torn(living, p_site, clique_id, found, config.clique_reach_m)
+    return _tear_cliques(living, p_site, clique_id, found, config.clique_reach_m)
 
 
-def _torn(living: LivingMap, p_site: FloatArray, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
+def _tear_cliques(living: LivingMap, p_site: FloatArray, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
     """Split off members of cliques that cannot be at the site of the others: a clique occupies one site.
 
     Those who stand at another known site, or at a new place though they have one at the site of the others, or out of

@@ -101,7 +101,7 @@ def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
     return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
 
 
-def resized(living: LivingMap, size: Size, metres: Metres) -> LivingMap:
+def resize(living: LivingMap, size: Size, metres: Metres) -> LivingMap:
     """Return the map scaled by a factor about its middle, with the updated uncertainty of its scale."""
     position = living.places.position_m
     middle = position.mean(axis=0)
@@ -269,7 +269,7 @@ def settled(
     )
 
 
-def settled_by(
+def settle_scales(
     shown: tuple[float, float], session: tuple[float, float], living: LivingMap, robot: str,
     settings: MetreConfig = USUAL_METRE,
 ) -> tuple[Size, Metres]:  # fmt: skip

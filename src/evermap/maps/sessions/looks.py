@@ -174,10 +174,10 @@ def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: Livi
     ))  # fmt: skip
     unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
     was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
-    unwitnessed = _unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
+    unwitnessed = _count_unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
     was_new = (~was_clear & (p_before > rules.blocked))[key]
     is_new = was_new & (~line_is_clear & (p_clear > rules.blocked))[key]
-    counts, sight, p_hidden, share, of_kind, space = _hidden(
+    counts, sight, p_hidden, share, of_kind, space = _weigh_hidden(
         living,
         p_start,
         rows,
@@ -221,14 +221,14 @@ def _different(place: IntArray, cell: IntArray, nominal: FloatArray) -> tuple[In
     return np.column_stack([every // span, every % span + lowest]), key, mean
 
 
-def _unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) -> FloatArray:
+def _count_unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) -> FloatArray:
     """(2,) of `n` cliques that were seen, how many were hidden, and shown, along lines that were unknown before."""
     tried, found = (np.bincount(rows.clique[some], minlength=n) for some in (was_unknown, was_unknown & rows.hit))
     there = (np.bincount(rows.clique[rows.hit], minlength=n) > 0) & (tried >= least)
     return np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
 
 
-def _hidden(
+def _weigh_hidden(
     living: LivingMap,
     p_start: FloatArray,
     rows: SiteLooks,

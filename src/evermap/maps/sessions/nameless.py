@@ -25,7 +25,7 @@ from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks, of_places
 from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
-from evermap.maps.bodies import log_density, squared_length
+from evermap.maps.bodies import log_density, square_lengths
 from evermap.maps.living import EXISTS, LivingMap
 from evermap.maps.names import anonymous_text, distinct_text
 from evermap.maps.sessions.admission import admit
@@ -36,7 +36,7 @@ from evermap.maps.sessions.placing import SMALLEST_P, one_to_one
 from evermap.slam.association import Identified, associate
 from evermap.slam.association.assignment import alike, visits_of, with_ids
 from evermap.slam.association.consensus import Candidates, consensus
-from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap, list_agreed_pairs
 from evermap.slam.association.features import Likeness, Traits, column_medians, learned
 from evermap.slam.association.identify import ALL_TRIED, Associated, numbered
 from evermap.slam.association.jcbb import gates
@@ -110,7 +110,7 @@ def without_ids(recording: AnyRecordingT, config: Config) -> AnyRecordingT:
     return replace(with_ids(recording, nobody, nobody, nobody[:0]), landmark_names={})
 
 
-def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> AnyRecordingT:
+def name_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> AnyRecordingT:
     """Return a recording with landmark ids by geometry: those of a map where its landmarks were met, new ones else.
 
     Args:
@@ -133,7 +133,7 @@ def named_in(recording: AnyRecordingT, living: LivingMap, config: Config) -> Any
     return replace(named, landmark_names={**recording.landmark_names, **texts})
 
 
-def numbered_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) -> AnyRecordingT:
+def number_in(recording: AnyRecordingT, prior_map: Landmarks, config: Config) -> AnyRecordingT:
     """Return the recording of `identify_in`."""
     return identify_in(recording, prior_map, config).recording  # type: ignore[return-value]
 
@@ -147,7 +147,7 @@ def identify_in(recording: AnyRecording, prior_map: Landmarks, config: Config) -
         config: settings.
 
     Raises:
-        DataError: as of `named_in`.
+        DataError: as of `name_in`.
     """
     living = replace(LivingMap.begun(prior_map, config.living.whole_places), clock=recording.clock)
     given = without_ids(recording, config)  # type: ignore[type-var]
@@ -193,7 +193,7 @@ class Where(NamedTuple):
     rotation: FloatArray
 
 
-def held_at(
+def hold_at(
     local: LocalMap, held: IntArray, position_m: FloatArray, covariance_m2: FloatArray, config: OverlayConfig
 ) -> Where:
     """Return the landmarks of a session in the map, given that some of them (H,) are at places (H, D), of covariance (D
@@ -320,8 +320,8 @@ class _Assigned:
         while np.any(place >= 0):
             place = self._compared(place)._grown(place)
             where = self._where(np.arange(len(place)), place)
-            member = self._compared(place)._assigned(where, place)
-            more = self._regained(where, member, place)
+            member = self._compared(place)._assign_members(where, place)
+            more = self._regain_places(where, member, place)
             if np.array_equal(more, place):
                 break
             place = more
@@ -351,7 +351,7 @@ class _Assigned:
         off, variance = at[some] - place_m[k], loose.wide_m[some] ** 2 + where.drift_m**2
         spread = covariance_m2[k] + variance[:, None, None] * np.eye(self._dim)
         score = np.log(p[k]) + log_density(off, spread) - math.log(self._density)
-        score[squared_length(off, spread) > GATE[self._dim]] = -np.inf
+        score[square_lengths(off, spread) > GATE[self._dim]] = -np.inf
         p_own = self._slam.association.p_own
         found = most_probable(loose.row[some], k, score, frame, len(place_m), p_own)
         rows = np.flatnonzero(found >= len(local))
@@ -368,7 +368,7 @@ class _Assigned:
         held = np.flatnonzero(place[some] >= 0)
         at = self._stood.row[place[some[held]]]
         known = of_places(self._living.covariance_m2, at, self._dim)
-        return held_at(self._local.part(some), held, self._living.places.position_m[at], known, self._overlay)
+        return hold_at(self._local.part(some), held, self._living.places.position_m[at], known, self._overlay)
 
     def _grown(self, place: IntArray) -> IntArray:
         """Return (K,) `place` with all certain matches: outwards from the given ones, in agreeing groups."""
@@ -380,7 +380,7 @@ class _Assigned:
             group = left[np.argsort(away.min(axis=1), kind="stable")[:GROUP]]
             near = held[np.argsort(np.linalg.norm(x[group][:, None] - x[held], axis=2).min(axis=0))[:MOST_HELD]]
             where = self._where(np.append(group, near), place)
-            mine, theirs = self._agreed(group, where, place)
+            mine, theirs = self._match_group(group, where, place)
             place[mine] = theirs
             tried[group] = True
             if len(mine):  # what was in doubt may be none beside these
@@ -388,7 +388,7 @@ class _Assigned:
                 tried[np.setdiff1d(np.flatnonzero(place < 0), group)] = False
         return place
 
-    def _agreed(self, group: IntArray, where: Where, place: IntArray) -> tuple[IntArray, IntArray]:
+    def _match_group(self, group: IntArray, where: Where, place: IntArray) -> tuple[IntArray, IntArray]:
         """Return landmarks of a group, the first of `where`, and the places that they certainly match."""
         stood = self._stood
         free = ~np.isin(stood.landmark, stood.landmark[place[place >= 0]])
@@ -446,7 +446,7 @@ class _Assigned:
         nats = self._every_like(np.arange(len(self._local.place)))[:, self._stood.landmark]
         return np.asarray(nats >= -self._slam.association.readings.misread_nats)
 
-    def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
+    def _regain_places(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
         """Return `place` with landmarks beyond their gates after a distorted stretch, by their constellation."""
         stood, together, found = self._stood, self._found.together, place.copy()
         stands, left = np.flatnonzero(stood.p >= EXISTS), np.flatnonzero(member < 0)
@@ -495,7 +495,7 @@ class _Assigned:
             stands = stands[index.around(laid.reshape(-1, self._dim), 2.0 * rules.near_m)]
         for drift_m in sorted({max(self._overlay.drifts_m), min(self._overlay.drifts_m)}, reverse=True):
             at, spread = self._about(stands, drift_m)
-            pairs = agreed_pairs(
+            pairs = list_agreed_pairs(
                 local,
                 LocalMap(at, block_diag(*spread), None if local.rotation is None else self._stood.rotation[stands]),
                 allowed[np.ix_(some, stands)],
@@ -531,7 +531,7 @@ class _Assigned:
             away.min(axis=0, initial=np.inf) < self._beside_m
         )
         stands, moved = (odds - math.log(self._density) - missed[m] for odds in (stands, moved))
-        stands[squared_length(step, spread) > GATE[self._dim]] = -np.inf
+        stands[square_lengths(step, spread) > GATE[self._dim]] = -np.inf
         if self._local.rotation is not None:
             rules = self._slam.association.space
             angle = se3.angle_between(se3.turn(where.rotation[k]), se3.turn(stood.rotation[m]))
@@ -540,7 +540,7 @@ class _Assigned:
         like = np.zeros(len(k)) if self._traits is None else self._traits.nats(some[k], stood.landmark[m])
         return k, m, stands, moved, like
 
-    def _assigned(self, where: Where, place: IntArray) -> IntArray:
+    def _assign_members(self, where: Where, place: IntArray) -> IntArray:
         """Return (K,) rows of the members that landmarks match, including uncertain ones; -1 for new ones."""
         stood, every = self._stood, np.arange(len(place))
         k, m, stands, moved, like = self._odds(every, where, np.ones(len(stood.p), dtype=np.bool_))
@@ -555,7 +555,7 @@ class _Assigned:
         np.maximum.at(table, (k, stood.landmark[m]), moved + like)
         table[member >= 0], table[:, member[member >= 0]] = -np.inf, -np.inf
         member = np.where(member >= 0, member, one_to_one(table))
-        return member if self._traits is None else self._recognised(member)
+        return member if self._traits is None else self._recognise(member)
 
     def _with_exchanged(
         self, table: FloatArray, held: IntArray, at_place: tuple[IntArray, IntArray, FloatArray]
@@ -579,7 +579,7 @@ class _Assigned:
         another[alone] -= math.log(table.shape[1])
         return np.asarray(np.maximum(table, another))
 
-    def _recognised(self, member: IntArray) -> IntArray:
+    def _recognise(self, member: IntArray) -> IntArray:
         """Return (K,) `member` with landmarks that were moved far recognised by what they are like."""
         left, count = np.flatnonzero(member < 0), len(self._living.members)
         p_away, table = np.zeros(count), np.full((len(member), count), -np.inf)

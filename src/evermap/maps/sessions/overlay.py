@@ -455,13 +455,13 @@ class _Options:
                     flips.append((gain, c, best))
             if not flips:
                 break
-            chosen = self._flipped(chosen, sorted(flips, key=lambda flip: -flip[0]))
+            chosen = self._flip_some(chosen, sorted(flips, key=lambda flip: -flip[0]))
             if chosen.tobytes() in seen:  # two that hold each other: the rest of the way leads back
                 break
             seen.add(chosen.tobytes())
         return chosen
 
-    def _flipped(self, chosen: IntArray, flips: list[tuple[float, int, int]]) -> IntArray:
+    def _flip_some(self, chosen: IntArray, flips: list[tuple[float, int, int]]) -> IntArray:
         """Return the assignment with the first flip, and with as many others as make the whole more probable.
 
         Cliques are taken away one at a time: what contradicts a wrong one is right.
@@ -517,10 +517,10 @@ class _Options:
 
     def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
         """Return the log probability of the options, with the density of landmarks at their sites, and their number."""
-        rows = self._chosen_rows(chosen)
+        rows = self._choose_rows(chosen)
         total = 0.0
         if len(rows):
-            total = log_density_of(*self._factored(rows), self._free(rows), None)
+            total = log_density_of(*self._factorise_gaps(rows), self._free(rows), None)
         for clique, sites in enumerate(self.sites):
             if sites:
                 site = int(chosen[clique])
@@ -529,7 +529,7 @@ class _Options:
 
     def n_standing(self, chosen: IntArray) -> int:
         """Return landmarks that are at their places in the map."""
-        rows = self._chosen_rows(chosen)
+        rows = self._choose_rows(chosen)
         return len(np.unique(self.known.landmark[rows[rows < self.n_places]]))
 
     def concluded(self, chosen: IntArray) -> Overlay:
@@ -549,7 +549,7 @@ class _Options:
                 probability[mine] = share[list(scores).index(best)]
                 continue
             probability[mine] = share[moved].sum()
-        rows = self._chosen_rows(chosen)
+        rows = self._choose_rows(chosen)
         rows = rows[rows < self.n_places]
         matched = self.known.landmark[rows]
         motion = self.motion
@@ -562,7 +562,7 @@ class _Options:
         standing = [len(self._rows[int(o)]) if self._stands(o) else 0 for o in chosen]
         return not standing[without] or sum(standing) - standing[without] >= 2
 
-    def _chosen_rows(self, chosen: IntArray) -> IntArray:
+    def _choose_rows(self, chosen: IntArray) -> IntArray:
         parts = [self._rows[int(site)] for site in chosen if site != ELSEWHERE]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
@@ -626,15 +626,15 @@ class _Options:
 
     def _field(self, chosen: IntArray) -> _Field:
         """What all places that are chosen say of the others."""
-        rows = self._chosen_rows(chosen)
+        rows = self._choose_rows(chosen)
         across = self._covariance(np.arange(len(self.known.site)), rows)
-        return _Field(*self._factored(rows), self._free(rows), across)
+        return _Field(*self._factorise_gaps(rows), self._free(rows), across)
 
     def _free(self, rows: IntArray) -> FloatArray:
         """Return how differences of places change with the motion, in its standard deviations."""
         return np.asarray(self._freedom[se2.xy_rows(self.known.landmark[rows], self.dim)])
 
-    def _factored(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _factorise_gaps(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Differences of places, and the lower Cholesky factor of their covariance for a known motion."""
         error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
         return error, np.asarray(np.linalg.cholesky(self._covariance(rows, rows)))

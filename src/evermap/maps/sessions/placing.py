@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import FitConfig, LivingConfig, OverlayConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
@@ -20,7 +20,7 @@ from evermap.maps.bodies import log_density
 from evermap.maps.living import LivingMap, Places, rows_among
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.maps.vicinity import Vicinity, near
-from evermap.slam.batch import ALIGNED_INFORMATION, FINAL_GAIN, FINAL_TOLERANCE, Outcome, divided, sighted_at
+from evermap.slam.batch import ALIGNED_INFORMATION, FINAL_GAIN, FINAL_TOLERANCE, Outcome, divided, sight_at
 from evermap.slam.calibration import FORWARD, SLOPE, CalibrationPrior
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
@@ -147,7 +147,7 @@ def _turns(rotation: FloatArray) -> FloatArray:
     return se3.turn(np.where(np.isfinite(rotation[:, :1]), rotation, se3.NO_TURN))
 
 
-def laid_over(
+def lay_over_map(
     living: LivingMap,
     p_site: FloatArray,
     landmark_id: IntArray,
@@ -335,11 +335,11 @@ def refitted(
     """
     problem, start = _in_map(outcome, prior, pose_map_session, size, held)
     noise = outcome.noise.noise
-    solved = smoother, estimate, _ = _solved(problem, noise, start, robust=robust)
+    solved = smoother, estimate, _ = _solve_near(problem, noise, start, robust=robust)
     straightened = False
     if smoother.inlier_probability(estimate).mean() < (1.0 - settings.most_lost) * outcome.inlier.mean():
         # a blind stretch bent the session by more than a descent can take back: every stretch placed by itself
-        other = _solved(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
+        other = _solve_near(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
         if other[0].cost(other[1]) < smoother.cost(estimate):
             solved, straightened = other, True
     in_map = divided(solved, prior, outcome.p_needed, outcome.noise, outcome.revision, aligned=True, averaged=False)
@@ -377,13 +377,15 @@ def _in_map(
     return problem, start
 
 
-def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) -> tuple[Smoother, Estimate, Marginals]:
+def _solve_near(
+    problem: Problem, noise: Noise, start: Estimate, *, robust: bool
+) -> tuple[Smoother, Estimate, Marginals]:
     """The optimum near `start`, and its covariances."""
     # first with the kernel that never lets go: what was near the session's own map need not be near this one
     near = Smoother(problem, noise, heavy=True, robust=robust)
-    start, _ = exhausted(near.solved_in_slices(start, iterations=HEAVY_STEPS, tolerance=1e-3))
+    start, _ = exhaust(near.solve_in_slices(start, iterations=HEAVY_STEPS, tolerance=1e-3))
     smoother = near.under(noise, heavy=False)
-    return smoother, *exhausted(smoother.solved_in_slices(start, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
+    return smoother, *exhaust(smoother.solve_in_slices(start, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
 
 
 def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfig) -> Estimate:
@@ -397,7 +399,7 @@ def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfi
     used = np.flatnonzero(held[problem.landmark_row])
     if len(used) < 2:
         return start
-    seen_m = sighted_at(start.pose[problem.pose_row], problem.reading, start.states, problem.mount)
+    seen_m = sight_at(start.pose[problem.pose_row], problem.reading, start.states, problem.mount)
     middle = np.searchsorted(problem.pose_row[used], np.arange(len(start.pose)))
     count = settings.window
     first = np.clip(middle - count // 2, 0, max(len(used) - count, 0))
@@ -410,7 +412,7 @@ def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfi
         weight = 1.0 / (1.0 + (gap / settings.placing_m) ** 2)
     pose = se2.compose(motion, start.pose)
     landmark = start.landmark.copy()
-    anew = sighted_at(pose[problem.pose_row], problem.reading, start.states, problem.mount)
+    anew = sight_at(pose[problem.pose_row], problem.reading, start.states, problem.mount)
     for j in np.setdiff1d(problem.landmark_row, row):
         landmark[j] = np.median(anew[problem.landmark_row == j], axis=0)
     return Estimate(pose, landmark, start.states)

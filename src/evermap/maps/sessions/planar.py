@@ -170,19 +170,21 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, own: OwnLandmarks
     """Return the alignment of the session, by its own landmarks, with the map; None if no landmarks match."""
     names = alone.prepared.landmark_id[own.row]
     log_sigma = float(np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance)))
-    where = placing.laid_over(living, p_site, names, own.position_m, gaussian.of_unknown_size(own, log_sigma), config)
+    where = placing.lay_over_map(
+        living, p_site, names, own.position_m, gaussian.of_unknown_size(own, log_sigma), config
+    )
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if where.reason:
         return where
     if config.search == "joint":
-        together = _seen_together(alone, own.row, config.fit.inlier)
+        together = _count_together(alone, own.row, config.fit.inlier)
         where = placing.unbent(living, p_site, where, own.position_m, together, config.fit)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return placing.with_glimpsed(living, where, glimpsed)
 
 
-def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_array:
+def _count_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_array:
     """(K, K) frames in which two landmarks of a session, rows of its problem, were seen where they are."""
     fits = alone.outcome.inlier >= least
     problem = alone.outcome.problem
@@ -242,10 +244,10 @@ def refit(
         if part:  # it does not change the metre of the rest
             found = gaussian.settled(*shown, own_metre, living.log_size_variance, np.inf, config.metre)
         else:
-            found, metres = gaussian.settled_by(shown, own_metre, living, alone.recording.robot, config.metre)
-            living = gaussian.resized(living, found, metres)
+            found, metres = gaussian.settle_scales(shown, own_metre, living, alone.recording.robot, config.metre)
+            living = gaussian.resize(living, found, metres)
         size *= found.session_factor
-        alone = _remarked(alone, shown[0], found, config.metre)
+        alone = _add_remark(alone, shown[0], found, config.metre)
 
     hold = functools.partial(_hold, outcome, names, living, size)
     solve_held = functools.partial(placing.refitted, outcome, outcome.prior, settings=config.fit, robust=robust)
@@ -284,7 +286,7 @@ def _hold(
     return motion, size, Held(row, position, covariance)
 
 
-def _remarked(alone: Solved, log_ratio: float, found: gaussian.Size, settings: MetreConfig) -> Solved:
+def _add_remark(alone: Solved, log_ratio: float, found: gaussian.Size, settings: MetreConfig) -> Solved:
     """A session with a remark where its metre contradicts the map's, or its robot's those of the others."""
     contradicts = found.off > settings.contradicts
     if not (contradicts or found.apart):

@@ -22,7 +22,7 @@ from evermap.maps.sessions.believe import Witnessed, aged
 from evermap.maps.sessions.extend import Extended, Found, fellows_of, first_and_last
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
-from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, laid_over, places_in, widened
+from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, Turned, lay_over_map, places_in, widened
 from evermap.maps.vicinity import Vicinity, cliques_of
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
@@ -31,10 +31,10 @@ from evermap.slam.intake import find_bodies, most_of
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.bodies import with_rests
 from evermap.slam.space.bridge import bridge
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
-from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
+from evermap.slam.space.result import conclude_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, fit_to_map, solve_space
 from evermap.slam.space.together import SolvedRobot, solve_space_together
 from evermap.slam.space.up import sensor_axes
@@ -79,7 +79,7 @@ class SpatialVisit:
 
     def concluded(self, scratch: str = "first_pose") -> SlamResult:
         """Return the session as the estimator has it; `scratch` is what its frame is where there is no map."""
-        return concluded_in_space(self.recording, self.intake, self.solved, scratch)
+        return conclude_in_space(self.recording, self.intake, self.solved, scratch)
 
     def begun(self, living: LivingMap) -> LivingMap:
         """Return an empty map: in space the scale is that of the sensors."""
@@ -190,7 +190,7 @@ class SpatialVisit:
         if where is None:
             covariance = anchored(position, covariance)
         else:
-            position, covariance = _fused(position, covariance, laid[row], living, where.drift_m)
+            position, covariance = _fuse_places(position, covariance, laid[row], living, where.drift_m)
         kind = most_of(problem.place, self.recording.detections.class_id[self.intake.used], count)
         rotation = self._as_known(row, rotation, laid[row], living)
         body = find_bodies(self.intake.landmark_id, self.recording.objects)[self.solved.identity[row]]
@@ -364,7 +364,7 @@ def _near_hits(stamp_s: FloatArray, detected: BoolArray, within_s: float) -> Boo
     return np.asarray((stamp_s[:, None] - before <= within_s) | (after - stamp_s[:, None] <= within_s))
 
 
-def localised_in_space(
+def localise_in_space(
     recording: SpatialRecording,
     living: LivingMap,
     config: Config,
@@ -384,7 +384,7 @@ def localised_in_space(
     stands = standing(part, p_site)
     intake = fit_to_map(intake, stands)
     solved = solve_space(intake, stands, progress=progress)
-    visit = SpatialVisit(recording, intake, _numbered(intake, solved, part))
+    visit = SpatialVisit(recording, intake, _name_nearest(intake, solved, part))
     where = _laid(visit, part, p_site, settings)
     if where is None or np.count_nonzero(where.place >= 0) < 2:
         return Localised.lost(visit, living, NOT_FOUND)
@@ -410,7 +410,7 @@ def names_of(intake: SpatialIntake) -> IntArray:
     return np.column_stack([intake.landmark_id, others_of])
 
 
-def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -> SpatialSolved:
+def _name_nearest(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -> SpatialSolved:
     """The session with landmarks of one identity named as the map names those that are nearest."""
     from scipy.optimize import linear_sum_assignment
 
@@ -437,10 +437,10 @@ def _laid(visit: SpatialVisit, living: LivingMap, p_site: FloatArray, config: Li
     alike = visit.optimum.smoother.problem.symmetries[row]
     turned = Turned(se3.identity(), rotation, alone.rotation[row], alike)
     position = place[row, :3] + alone.shift_m[row]
-    return laid_over(living, p_site, names[row], position, alone.covariance_m2[np.ix_(at, at)], config, turned)
+    return lay_over_map(living, p_site, names[row], position, alone.covariance_m2[np.ix_(at, at)], config, turned)
 
 
-def _fused(
+def _fuse_places(
     position_m: FloatArray, covariance_m2: FloatArray, place: IntArray, living: LivingMap, drift_m: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return positions (K, 3) and their joint covariance from a session and the map, fused for those with a `place`."""
@@ -472,4 +472,4 @@ def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum
     sigma[:, 3:][unseen > 0.0] = ANY_RAD
     prior = PlacePrior(row.astype(np.int64), pose, sigma, np.ones(len(row)))
     problem = replace(problem, prior=prior, start_sigma=FREE)
-    return converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
+    return converge(problem, optimum.estimate, optimum.noise, heavy_rounds=0)

@@ -608,11 +608,11 @@ def _arrays(columns: Mapping[str, Any], fetch: Fetch) -> dict[str, NDArray[Any]]
         flat = np.frombuffer(bytearray(raw), dtype)  # of a bytearray it can be written to, as any other array
         if len(flat) != (shape[0] * (shape[0] + 1) // 2 if lower else math.prod(shape)):
             raise DamagedError(f"column '{column}' has {len(flat)} values, which is not its shape {shape}")
-        arrays[column] = _unfolded(flat, shape[0]) if lower else flat.reshape(shape)
+        arrays[column] = _unfold(flat, shape[0]) if lower else flat.reshape(shape)
     return arrays
 
 
-def _unfolded(lower: FloatArray, size: int) -> FloatArray:
+def _unfold(lower: FloatArray, size: int) -> FloatArray:
     """The symmetric matrix of its values up to the diagonal."""
     matrix = np.empty((size, size))
     rows, columns = np.tril_indices(size)

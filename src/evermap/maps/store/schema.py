@@ -132,7 +132,7 @@ def _records(connection: Connection) -> None:
         connection.execute(text(f"DROP TABLE {table}"))
 
 
-def _pruned(connection: Connection) -> None:
+def _list_pruned(connection: Connection) -> None:
     """3 to 4: which revisions are pruned; the row of `store` is sealed anew, so it must be what was written."""
     columns = "schema_version, created_at, evermap_version, head, record, checksum"
     for *values, sealed in connection.execute(text(f"SELECT {columns} FROM store")).all():  # nosec  # B608: ours
@@ -194,5 +194,5 @@ def _put(connection: Connection, raw: bytes) -> bytes:
     return name
 
 
-MIGRATIONS: tuple[Callable[[Connection], None], ...] = (_landmarks_of_changes, _records, _pruned)
+MIGRATIONS: tuple[Callable[[Connection], None], ...] = (_landmarks_of_changes, _records, _list_pruned)
 """Number k leads from schema k + 1 to k + 2. Never changed once released: they speak SQL, not the tables of today."""

@@ -152,7 +152,7 @@ class SqlStore(Shown, MapStore):
             record = self._chain.record_of(connection, number)
             pruned = list_pruned(connection)
             if number in pruned:
-                raise self._gone(number, pruned[number], self._chain.read(connection)[0].keys() - pruned.keys())
+                raise self._report_gone(number, pruned[number], self._chain.read(connection)[0].keys() - pruned.keys())
             return self._unpacked(connection, record)
 
     def members(self, revision: int | None = None) -> Members:
@@ -510,7 +510,7 @@ class SqlStore(Shown, MapStore):
             found -= record.chunks(fetch, "" if number in kept else content.MEMBERS)
         return found
 
-    def _gone(self, number: int, since: str, kept: Collection[int]) -> PrunedRevisionError:
+    def _report_gone(self, number: int, since: str, kept: Collection[int]) -> PrunedRevisionError:
         utc = since.replace("T", " ").replace("+00:00", " UTC")
         gone = f"is pruned since {utc}" if since else "was pruned or lost to damage"
         problem = f"the content of revision {number} {gone}; kept: {ranges(kept)}"
@@ -560,7 +560,7 @@ class SqlStore(Shown, MapStore):
             with self._engine.execution_options(writes=writes).connect() as connection, connection.begin():
                 yield connection
         except (DamagedError, UnicodeDecodeError) as error:  # the latter even from the driver's own messages
-            raise self._damaged(str(error)) from error
+            raise self._describe_damage(str(error)) from error
         except IntegrityError as error:
             raise StaleRevisionError(
                 f"another process committed at the same time: {error.orig}", path=self.where, hint="run it again"
@@ -573,9 +573,9 @@ class SqlStore(Shown, MapStore):
             if self._engine.dialect.name == "postgresql":  # that checks its own pages
                 hint = "check the address, the rights of the user, and that the server runs"
                 raise StoreUnavailableError(f"PostgreSQL: {message}", path=self.where, hint=hint) from error
-            raise self._damaged(message) from error
+            raise self._describe_damage(message) from error
 
-    def _damaged(self, problem: str) -> InputError:
+    def _describe_damage(self, problem: str) -> InputError:
         """Return one line that names the intact revisions, and how to revert to them."""
         explained = self._explain(problem)
         if explained is not None:

@@ -163,7 +163,7 @@ def is_judged(audit: Audit) -> bool:
     return audit.is_heard and not audit.of_map
 
 
-def listed_rows(audit: Audit, *, everything: bool = False) -> list[tuple[str, ...]]:
+def list_rows(audit: Audit, *, everything: bool = False) -> list[tuple[str, ...]]:
     """Return the rows of what is to be known: faults and what cannot be decided; or of every entry."""
     doubtful = is_judged(audit)
     told = [entry for entry in audit.entries if everything or entry.state.is_fault or (doubtful and is_doubtful(entry))]
@@ -191,7 +191,7 @@ def markdown(audit: Audit, file: SurveyFile, written: Path | None) -> str:
     """Return the report as Markdown."""
     title, message = f"Audit of {file.path.name}", conclude(audit)[1]
     lines = [f"# {title}", "", f"**{message[0].upper()}{message[1:]}.**", "", "![plan](figures/audit.png)", ""]
-    rows = listed_rows(audit)
+    rows = list_rows(audit)
     if rows:
         lines += ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
         lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
@@ -287,8 +287,8 @@ def _page(audit: Audit, file: SurveyFile, figure: Any, written: Path) -> str:
         card("Open", float(counts["undecided"] + counts["unseen"]), "{:.0f}", "entries",
              f"{counts['undecided']} undecided, {counts['unseen']} never looked at."),
     ]  # fmt: skip
-    rows = [tuple(map(escape, row)) for row in listed_rows(audit)]
-    every = [tuple(map(escape, row)) for row in listed_rows(audit, everything=True)]
+    rows = [tuple(map(escape, row)) for row in list_rows(audit)]
+    every = [tuple(map(escape, row)) for row in list_rows(audit, everything=True)]
     parts = [
         cards_html(cards),
         figure_html(figure),

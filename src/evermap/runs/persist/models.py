@@ -125,13 +125,13 @@ def some_looks(looks: Looks, features: IntArray, most: int) -> tuple[Looks, IntA
 
     Of a single feature with more looks its latest are returned.
     """
-    part, rows = looks.at(features[drawn_features(np.diff(looks.first)[features], most)])
+    part, rows = looks.at(features[draw_features(np.diff(looks.first)[features], most)])
     if len(rows) <= most:
         return part, rows
     return looks.taken(rows[-most:], np.array([0, most])), rows[-most:]
 
 
-def drawn_features(counts: IntArray, most: int) -> IntArray:
+def draw_features(counts: IntArray, most: int) -> IntArray:
     """Return which features, with so many looks each, to learn from: all, or so many at random as have at most `most`
     looks together, but at least one.
     """

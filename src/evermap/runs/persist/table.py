@@ -375,7 +375,7 @@ class PartedLooks:
             InputError, ConfigError: as `read_looks`; a table with truth, which is scored in one piece only.
         """
         _check_defaults(config.p_miss, config.p_false)
-        found = _surveyed(path)
+        found = _survey(path)
         order = natural_order(list(found.features))
         names = tuple(np.array(list(found.features), dtype=object)[order].tolist())
         rows, looks, classes = (np.array(column)[order] for column in zip(*found.features.values(), strict=True))
@@ -438,7 +438,7 @@ class _Surveyed:
     clock: Clock | None
 
 
-def _surveyed(path: Path) -> _Surveyed:
+def _survey(path: Path) -> _Surveyed:
     found = _Surveyed({}, [""], Span(np.inf, -np.inf, np.inf, -np.inf), None)
     for table in parquet_batches(path):
         _explain_missing(table)

@@ -26,7 +26,7 @@ from evermap.runs.folder import RunFolder
 from evermap.runs.persist.changes import MOST_FEATURES, most_changed
 from evermap.runs.persist.models import (
     LearnedModels,
-    drawn_features,
+    draw_features,
     grouping_of,
     groups_of,
     learn_models,
@@ -68,10 +68,10 @@ def write_persist(
             save_models(result.models, result.learned.per, folder.path("model.json"))
         timing = {f"{name}_s": seconds for name, seconds in result.step_s.items()}
         timing["write_s"] = perf_counter() - start
-        return _finished(folder, result, clock, info or RunInfo(), timing, progress)
+        return _finish(folder, result, clock, info or RunInfo(), timing, progress)
 
 
-def _finished(
+def _finish(
     folder: RunFolder,
     result: PersistResult,
     clock: Clock | None,
@@ -126,7 +126,7 @@ def persist_in_parts(
         learned, with_model = _learned(folder, parted, config)
         quoted, numbered = needs_quotes(arrow_cells(list(parted.names))), are_numbers(parted.names)
         work = partial(
-            _worked_on, parted=parted.alone(), config=with_model, quoted=quoted, numbered=numbered, folder=scratch
+            _work_on, parted=parted.alone(), config=with_model, quoted=quoted, numbered=numbered, folder=scratch
         )
         items = list(map(str, range(len(parted.files))))
         done = spread_over(items, work, workers=workers, cluster=cluster, progress=progress)
@@ -138,7 +138,7 @@ def persist_in_parts(
         shown = run_persist(parted.of(_shown(parted, done, totals, config)), with_model)
     told = tuple(remarks(config, shown.models, totals))
     result = replace(shown, config=config, learned=learned, totals=totals, warnings=told)
-    return _finished(folder, result, clock, info or RunInfo(), {"parts_s": perf_counter() - start}, None)
+    return _finish(folder, result, clock, info or RunInfo(), {"parts_s": perf_counter() - start}, None)
 
 
 class _Part(NamedTuple):
@@ -149,7 +149,7 @@ class _Part(NamedTuple):
     latest: FloatArray
 
 
-def _worked_on(
+def _work_on(
     number: str, parted: PartedLooks, config: PersistConfig, quoted: bool, numbered: bool, folder: Path
 ) -> _Part:
     """Run a part, and write its pieces of the files."""
@@ -180,7 +180,7 @@ def _learned(
         raise ConfigError(problem, field="per", hint=hint)
     groups = [features for _, features in groups_of(parted, per)]
     most = max(config.learn_from // len(groups), 2)
-    chosen = [features[drawn_features(parted.looks[features], most)] for features in groups]
+    chosen = [features[draw_features(parted.looks[features], most)] for features in groups]
     table = parted.of(np.sort(np.concatenate(chosen)))
     learned = learn_models(table, table.looks(table.order()), config.model_copy(update={"per": per}))
     save_models(learned.models, learned.per, folder.path("model.json"))

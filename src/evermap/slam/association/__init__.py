@@ -24,11 +24,11 @@ def associate(recording: AnyRecording, settings: SlamConfig, *, keep_ids: bool) 
         DataError: too few frames with detections, or too many for the memory; in space, no odometry.
     """
     from evermap.slam.association.identify import associated
-    from evermap.slam.association.in_space import associated_in_space
+    from evermap.slam.association.in_space import associate_in_space
     from evermap.slam.intake import beliefs
 
     if is_in_space(recording):
-        return associated_in_space(recording, settings, keep_ids=keep_ids)
+        return associate_in_space(recording, settings, keep_ids=keep_ids)
     return associated(recording, *beliefs(recording.sensor, settings), keep_ids=keep_ids, settings=settings)
 
 

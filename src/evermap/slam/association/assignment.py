@@ -10,7 +10,7 @@ from scipy import sparse
 
 from evermap.config import AssociationConfig, SlamConfig
 from evermap.slam.association.features import Likeness, Traits
-from evermap.slam.batch import USUAL, sighted_at
+from evermap.slam.batch import USUAL, sight_at
 from evermap.slam.problem import Estimate, Problem
 from evermap.types import UNKNOWN, AnyRecordingT, BoolArray, FloatArray, IntArray
 
@@ -124,7 +124,7 @@ def shared_variance(
     return variance
 
 
-def seen_together(
+def count_together(
     frame: IntArray, landmark_row: IntArray, n_frames: int, n_landmarks: int, around_frames: int
 ) -> tuple[sparse.csr_array, sparse.csr_array]:
     """Return (L, L) numbers of frames that show both of two landmarks, and of those that show one, while the other one
@@ -139,13 +139,13 @@ def seen_together(
     """
     shape = n_frames, n_landmarks
     around = frame + np.arange(-around_frames, around_frames + 1)[:, None]
-    each = _seen_in(frame, landmark_row, shape)
-    about = _seen_in(around.ravel(), np.tile(landmark_row, len(around)), shape)
+    each = _list_shown(frame, landmark_row, shape)
+    about = _list_shown(around.ravel(), np.tile(landmark_row, len(around)), shape)
     together, once = sparse.csr_array(each.T @ each), sparse.csr_array(each.T @ about)
     return together, sparse.csr_array(once + once.T - 2.0 * together)
 
 
-def _seen_in(frame: IntArray, landmark_row: IntArray, shape: tuple[int, int]) -> sparse.csr_array:
+def _list_shown(frame: IntArray, landmark_row: IntArray, shape: tuple[int, int]) -> sparse.csr_array:
     """(N, L) whether a frame shows a landmark, from frames (M,) and landmarks (M,) of detections."""
     inside = (landmark_row >= 0) & (frame >= 0) & (frame < shape[0])
     found = sparse.csr_array((np.ones(int(inside.sum())), (frame[inside], landmark_row[inside])), shape=shape)
@@ -186,7 +186,7 @@ def _extent(place: FloatArray, settings: SlamConfig) -> float:
     return max(float(np.prod(np.maximum(np.ptp(place, axis=0), side_m))) if len(place) else 0.0, least)
 
 
-def merged_rows(pairs: list[tuple[int, int]], n_landmarks: int) -> IntArray:
+def merge_rows(pairs: list[tuple[int, int]], n_landmarks: int) -> IntArray:
     """Return (L,) the landmark that each becomes if pairs (younger, older) are merged."""
     becomes = np.arange(n_landmarks)
     for younger, older in sorted(pairs, key=lambda pair: pair[0]):
@@ -248,7 +248,7 @@ class Assignment:
     def together(self) -> sparse.csr_array:
         """(L, L) number of frames that show both of two landmarks."""
         shape = len(self.measured.stamp_s), self.n_landmarks
-        each = _seen_in(self.measured.pose_row, self.landmark_row, shape)
+        each = _list_shown(self.measured.pose_row, self.landmark_row, shape)
         return sparse.csr_array(each.T @ each)
 
     @property
@@ -273,7 +273,7 @@ class Assignment:
     def points(self) -> FloatArray:
         """Return (M, 2) positions of the detections, as seen from their poses."""
         pose = self.estimate.pose[self.measured.pose_row]
-        return sighted_at(pose, self.measured.reading, self.estimate.states, self.measured.mount)
+        return sight_at(pose, self.measured.reading, self.estimate.states, self.measured.mount)
 
     @property
     def wide_m(self) -> FloatArray:
@@ -298,7 +298,7 @@ class Assignment:
     def without(self, landmarks: BoolArray) -> Assignment:
         """Return the assignment without some landmarks (L,), their detections unassigned."""
         rank = np.where(landmarks, NOBODY, np.cumsum(~landmarks) - 1)
-        return self._renumbered(rank, ~landmarks)
+        return self._renumber(rank, ~landmarks)
 
     def split(self, parts: list[IntArray]) -> Assignment:
         """Return the assignment with a new landmark for each of some rows of detections."""
@@ -311,10 +311,10 @@ class Assignment:
 
     def merged(self, pairs: list[tuple[int, int]]) -> Assignment:
         """Return the assignment with pairs (younger, older) merged: the place of the older, the detections of both."""
-        becomes = merged_rows(pairs, self.n_landmarks)
+        becomes = merge_rows(pairs, self.n_landmarks)
         kept = becomes == np.arange(self.n_landmarks)
         rank = np.cumsum(kept) - 1
-        return self._renumbered(rank[becomes], kept)
+        return self._renumber(rank[becomes], kept)
 
     def of_visits(self) -> tuple[IntArray, IntArray]:
         """Return `visits_of` these landmarks."""
@@ -347,7 +347,7 @@ class Assignment:
         place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
         return replace(self, landmark_row=row, estimate=replace(self.estimate, landmark=place))
 
-    def _renumbered(self, rank: IntArray, kept: BoolArray) -> Assignment:
+    def _renumber(self, rank: IntArray, kept: BoolArray) -> Assignment:
         row = np.full_like(self.landmark_row, NOBODY)
         seen = self.landmark_row >= 0
         row[seen] = rank[self.landmark_row[seen]]

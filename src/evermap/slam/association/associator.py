@@ -24,7 +24,7 @@ from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, same_name, visits_of
 from evermap.slam.association.features import Traits, best_with_traits, learned
 from evermap.slam.association.jcbb import Pairings, pairing_probability
-from evermap.slam.association.merging import Solution, accepted_rise, merge_while_any, propose_merges
+from evermap.slam.association.merging import Solution, find_most_rise, merge_while_any, propose_merges
 from evermap.slam.association.revise import LAST_ROUNDS
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -183,13 +183,13 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         """
         refused: set[tuple[int, int]] = set()
         total = math.inf
-        solved = self._realigned(self._corrected(self._merged(self._begun(begun)), refused))
+        solved = self._realign(self._correct_visits(self._merged(self._begun(begun)), refused))
         for left in reversed(range(LAST_ROUNDS)):
             before = solved
-            again = self._reassigned(before)
+            again = self._reassign(before)
             if self.has_own_noise and np.array_equal(again.landmark_row, before.landmark_row):
                 break
-            solved = self._corrected(self._merged(self._learned(again)), refused)
+            solved = self._correct_visits(self._merged(self._learned(again)), refused)
             if _are_same(before, again, solved):
                 break
             if goal < math.inf:
@@ -204,7 +204,7 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         Comparable between associations of one recording; `FoundT` as `finish` returns it, of this associator or another
         one of the same recording.
         """
-        return self._total(self._judged(found))
+        return self._total(self._judge(found))
 
     def of_visits(self, found: AnyAssignment) -> tuple[IntArray, IntArray]:
         """Return `visits_of` these landmarks."""
@@ -246,9 +246,9 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
             return pairs if pairs or within is not None else self._loose(solved, refused)
 
         def merge(solved: SolvedT, pairs: list[tuple[int, int]]) -> SolvedT | None:
-            trial = self._solved_merged(solved, pairs)
+            trial = self._solve_merged(solved, pairs)
             numbers = solved.numbers[[u for u, _ in pairs]]
-            rise = accepted_rise(pairs, solved.sightings, numbers, self._rules)
+            rise = find_most_rise(pairs, solved.sightings, numbers, self._rules)
             return trial if trial.cost - solved.cost <= rise else None
 
         return merge_while_any(solved, propose, merge)
@@ -282,15 +282,15 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         """The optimum of an association; None for that of `step`."""
 
     @abstractmethod
-    def _reassigned(self, solved: SolvedT) -> AssignmentT:
+    def _reassign(self, solved: SolvedT) -> AssignmentT:
         """Every detection with its most probable landmark, with overlooked landmarks, without those seen too seldom."""
 
     @abstractmethod
     def _learned(self, assignment: AssignmentT) -> SolvedT:
-        """The optimum of an assignment as `_reassigned` returns it, and the noise there."""
+        """The optimum of an assignment as `_reassign` returns it, and the noise there."""
 
     @abstractmethod
-    def _solved_merged(self, solved: SolvedT, pairs: list[tuple[int, int]]) -> SolvedT:
+    def _solve_merged(self, solved: SolvedT, pairs: list[tuple[int, int]]) -> SolvedT:
         """The optimum with pairs (younger, older) of landmarks merged."""
 
     @abstractmethod
@@ -302,7 +302,7 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         """The result of a search."""
 
     @abstractmethod
-    def _judged(self, found: FoundT) -> SolvedT:
+    def _judge(self, found: FoundT) -> SolvedT:
         """The optimum of an association by the noise with which all of this associator are judged."""
 
     @abstractmethod
@@ -314,11 +314,11 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         """Pairs (younger, older) by which a loose part of the map certainly fits to the rest."""
 
     @abstractmethod
-    def _corrected(self, solved: SolvedT, refused: set[tuple[int, int]]) -> SolvedT:
+    def _correct_visits(self, solved: SolvedT, refused: set[tuple[int, int]]) -> SolvedT:
         """Separate landmarks that are two, where this is better; what was tried without gain is in `refused`."""
 
     @abstractmethod
-    def _realigned(self, solved: SolvedT) -> SolvedT:
+    def _realign(self, solved: SolvedT) -> SolvedT:
         """Move what is displaced, where this is better."""
 
 

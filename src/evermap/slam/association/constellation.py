@@ -116,7 +116,7 @@ def overlays(
     return sorted(found.values(), key=lambda overlay: -overlay.log_evidence)
 
 
-def agreed_pairs(
+def list_agreed_pairs(
     source: LocalMap,
     target: LocalMap,
     allowed: BoolArray,
@@ -286,16 +286,16 @@ class LoosePart(NamedTuple):
         by_traits = assignment.traits.same(like.part(loose[k]), like.part(root[m]))
         allowed[k, m] = by_traits >= -rules.readings.misread_nats
         for k, m in np.argwhere(allowed):
-            allowed[k, m] = _ordered(loose[k], root[m]) not in refused
+            allowed[k, m] = _order_pair(loose[k], root[m]) not in refused
         whole = LocalMap(place, joint)
         return cls(loose, root, whole.part(loose), whole.part(root), allowed)
 
     def rows(self, pairs: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
         """Return pairs (younger, older) of the map, from those of `source` and `target`."""
-        return [_ordered(self.loose[k], self.root[m]) for k, m in pairs]
+        return [_order_pair(self.loose[k], self.root[m]) for k, m in pairs]
 
 
-def _ordered(u: int, o: int) -> tuple[int, int]:
+def _order_pair(u: int, o: int) -> tuple[int, int]:
     """(younger, older)."""
     return int(max(u, o)), int(min(u, o))
 

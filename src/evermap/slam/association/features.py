@@ -243,7 +243,7 @@ def learned(
         mean = column_medians(middle)
         value, middle = value - mean, middle - mean
         reading, least = _within(value, visit, middle, read, settings)
-        every = _clipped(middle, np.ones_like(middle), settings)
+        every = _clip_variances(middle, np.ones_like(middle), settings)
         own = reading / np.clip(read, 1, rules.most_readings)
         free = np.maximum(every - least, 0.0)
         share = _visit_share(middle, own, landmark, least, free, rules) if revisits else np.zeros_like(free)
@@ -305,7 +305,9 @@ def _within(
     left = 1.0 - 1.0 / np.maximum(read[of], 1.5)
     off = np.where(read[of] > 1, value[seen] - middle[of], np.nan)
     reading = (MEDIAN_TO_SIGMA * column_medians(np.abs(off) / np.sqrt(left))) ** 2
-    reading = np.where(reading > 0.0, reading, _clipped(off, left, settings))  # the median is 0 if values are rounded
+    reading = np.where(
+        reading > 0.0, reading, _clip_variances(off, left, settings)
+    )  # the median is 0 if values are rounded
     order = np.lexsort((seen, of))  # detections are in the order of time
     size = np.bincount(of, minlength=len(middle))
     rank = np.empty(len(seen), dtype=np.int64)
@@ -318,7 +320,7 @@ def _within(
         (each[1::2] + each[::2] >= settings.association.readings.fewest_in_halves) & (each[1::2] * each[::2] > 0),
     )
     by_chance = np.where(both, 1.0 / np.maximum(each[1::2], 1) + 1.0 / np.maximum(each[::2], 1), np.nan)
-    drifting = _clipped(np.where(both, apart, np.nan), np.ones_like(apart), settings)
+    drifting = _clip_variances(np.where(both, apart, np.nan), np.ones_like(apart), settings)
     more = 0.5 * (drifting - 0.5 * np.pi * reading * _mean(by_chance))
     return reading, np.where(np.isfinite(more), np.maximum(more, 0.0), 0.0)
 
@@ -334,7 +336,7 @@ def _mean(value: FloatArray) -> FloatArray:
     return np.asarray(np.where(known, value, 0.0).sum(axis=0) / known.sum(axis=0))
 
 
-def _clipped(off: FloatArray, left: FloatArray, settings: SlamConfig) -> FloatArray:
+def _clip_variances(off: FloatArray, left: FloatArray, settings: SlamConfig) -> FloatArray:
     """Variances (D,) of deviations (N, D), nan for none; left (N, D) is the share of their variance that remains."""
     squared = off**2 / left
     found = _mean(squared)

@@ -102,7 +102,7 @@ def associated(
     nameless = replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id)))
     prepared = prepare(nameless, settings=settings.odometry)
     # a few centimetres of the mount confuse nothing; a doubt about them would widen the gates
-    problem = replace(prepared.problem, prior=prior.mounted_as_stated().without_scale())
+    problem = replace(prepared.problem, prior=prior.mount_as_stated().without_scale())
     name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
     kind = np.column_stack([given.class_id, name])[prepared.used]
 
@@ -118,11 +118,11 @@ def associated(
         assignment = finished(first)
         rules, is_bent = settings.association, _is_bent(first, assignment)
         if is_bent or assignment.n_landmarks <= MOST_LED:
-            assignment = _best_of(first, assignment, first.led_by_odometry())
+            assignment = _best_of(first, assignment, first.lead_by_odometry())
             is_bent = is_bent and _is_bent(first, assignment)
         if is_bent or first.doubtful > rules.doubtful_share:
             again = functools.partial(PlanarAssociator, problem, noise, kind, traits=traits, settings=settings)
-            assignment = searched(first, assignment, lambda odometry: finished(again(odometry=odometry)))
+            assignment = search_assignment(first, assignment, lambda odometry: finished(again(odometry=odometry)))
         return first, assignment
 
     best = found(None)
@@ -130,7 +130,7 @@ def associated(
     if features is not None:
         best = with_traits(best, features[prepared.used], settings, found)
     associator, assignment = best
-    assignment, evidence = weighed_against_odometry(associator, assignment)
+    assignment, evidence = weigh_against_odometry(associator, assignment)
     row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
     scale = prior.split_scale(assignment.estimate.states, np.eye(N_STATES))[2]
@@ -153,11 +153,11 @@ def _best_of(associator: PlanarAssociator, assignment: Assignment, start: Assign
     return trial if associator.against(trial) < cost else assignment
 
 
-def weighed_against_odometry(
+def weigh_against_odometry(
     associator: PlanarAssociator, assignment: Assignment
 ) -> tuple[Assignment, AssociationEvidence]:
     """Return an association, or that by odometry alone if it explains the detections better; and what speaks for it."""
-    alone = without_ghosts(associator.led_by_odometry())
+    alone = without_ghosts(associator.lead_by_odometry())
     lead_nats = associator.against(alone) - associator.against(assignment) if alone.n_landmarks else math.nan
     closures = associator.closures(assignment)
     if lead_nats < -assignment.settings.association.landmark_nats:  # without loops both are the same but for rounding
@@ -176,7 +176,7 @@ def _in_metres(assignment: Assignment, noise: Noise, prior: CalibrationPrior) ->
     return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
 
-def searched(
+def search_assignment(
     associator: PlanarAssociator, assignment: Assignment, again: Callable[[FloatArray], Assignment]
 ) -> Assignment:
     """Return the best assignment of repeated rounds of particles, each started from the best assignment so far.
@@ -195,7 +195,7 @@ def searched(
         associator.against(assignment),
         outlier_nats / LITTLE * len(assignment.landmark_row) / associator.worth,
     )
-    odometry = at_first = associator.learned_odometry(assignment)
+    odometry = at_first = associator.learn_odometry(assignment)
     in_vain, asked = 0, False
     for k, seeds in enumerate(np.arange(MOST_ROUNDS * RUNS).reshape(-1, RUNS).tolist()):
         draw = functools.partial(drawn, assignment, odometry, wider=factors[k % len(factors)])
@@ -214,7 +214,7 @@ def searched(
         if in_vain == MOST_IN_VAIN or 0.0 < gained <= little:
             break
         if gained > 0.0 and k + 1 < MOST_ROUNDS:
-            odometry = associator.learned_odometry(trial)
+            odometry = associator.learn_odometry(trial)
     return assignment
 
 

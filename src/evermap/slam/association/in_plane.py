@@ -15,29 +15,29 @@ import numpy as np
 from scipy.special import gammaincc
 
 from evermap.config import AssociationConfig, SlamConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se2
 from evermap.slam.association.assignment import (
     NOBODY,
     Assignment,
     alike,
+    count_together,
     density_of_unmet,
     landmark_density,
     same_name,
-    seen_together,
 )
 from evermap.slam.association.associator import Associator
-from evermap.slam.association.constellation import LoosePart, agreed_pairs, overlays
+from evermap.slam.association.constellation import LoosePart, list_agreed_pairs, overlays
 from evermap.slam.association.features import Traits
 from evermap.slam.association.jcbb import Pairings, gates
 from evermap.slam.association.merging import (
     Differences,
     Solution,
-    tried_by_halves,
+    try_by_halves,
 )
-from evermap.slam.association.revise import likely_real, reassigned, unseen_nats, with_overlooked
-from evermap.slam.association.wrong_associations import displaced_stretches, laid, weighed_visits
-from evermap.slam.batch import USUAL, sighted_at
+from evermap.slam.association.revise import likely_real, reassign, unseen_nats, with_overlooked
+from evermap.slam.association.wrong_associations import find_displaced, laid, weigh_visits
+from evermap.slam.batch import USUAL, sight_at
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.filter_kernels import spread_of_frame
 from evermap.slam.linearise import detection_residuals
@@ -181,7 +181,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         super().step()
         self._pose[self._done - 1] = self._near.pose
         if self._done == self._next_batch:
-            self._go_on_from(self._settled(self._without_chance(self._assignment()), self._sigma, RECENT))
+            self._go_on_from(self._settle(self._without_chance(self._assignment()), self._sigma, RECENT))
             self._next_batch = self._done + max(FIRST_BATCH, int(BATCH_SHARE * self._done))
 
     def _drive(self, near: PlanarFilter, times: float) -> PlanarFilter:
@@ -200,13 +200,13 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         Args:
             pose: returns these poses (N, 3); called only if needed.
         """
-        solved = self._settled(self._assignment(), self._sigma)
+        solved = self._settle(self._assignment(), self._sigma)
         self._go_on_from(solved)
         now = solved.assignment
         if not len(_twice(now)):
             return
         begun = replace(now, estimate=replace(now.estimate, pose=pose()))
-        again, first = self._solved(begun.split_visits()), 0
+        again, first = self._solve_assignment(begun.split_visits()), 0
         while (later := again.assignment.n_landmarks - first) > 0:
             again = self._merged(again, within=(first, later - RECENT))
             first = again.assignment.n_landmarks - (later - RECENT)
@@ -217,31 +217,31 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
 
     def _begun(self, begun: Assignment | None) -> PlanarSolution:
         if begun is None:
-            return self._solved(_with_sigma(self._assignment(), self._sigma))
-        return self._solved(begun)
+            return self._solve_assignment(_with_sigma(self._assignment(), self._sigma))
+        return self._solve_assignment(begun)
 
-    def _reassigned(self, solved: PlanarSolution) -> Assignment:
+    def _reassign(self, solved: PlanarSolution) -> Assignment:
         now, explained = solved.assignment, solved.marginals.explained_detections
-        again = with_overlooked(reassigned(now, explained, density=solved.density_m2))
+        again = with_overlooked(reassign(now, explained, density=solved.density_m2))
         return _with_sigma(again.without(_seldom(again)), solved.sigma)
 
     def _learned(self, assignment: Assignment) -> PlanarSolution:
-        return self._solved(assignment)
+        return self._solve_assignment(assignment)
 
     def _result(self, solved: PlanarSolution) -> Assignment:
         if not self._is_finished:
             self._is_finished, self.worth = True, correlated(solved.assignment)
-        return without_ghosts(self._attached(solved).assignment)
+        return without_ghosts(self._attach_part(solved).assignment)
 
     def closures(self, found: Assignment) -> Closures:
         """Return what the loops cost that an association closes; `found` as `finish` returns it."""
         if not found.n_landmarks:
             return Closures(0, 0.0)
-        solved = self._judged(found)
-        apart = self._solved(solved.assignment.split_visits())
+        solved = self._judge(found)
+        apart = self._solve_assignment(solved.assignment.split_visits())
         return Closures(apart.n_landmarks - solved.n_landmarks, solved.cost - apart.cost)
 
-    def led_by_odometry(self) -> Assignment:
+    def lead_by_odometry(self) -> Assignment:
         """Return landmarks where detections lie together by odometry alone, each visit by itself, near their optimum.
 
         It depends on no association so far.
@@ -256,13 +256,13 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         for _ in range(ALONE_ROUNDS):
             if not found.n_landmarks:
                 break
-            solved = self._solved(found.split_visits())
-            again = reassigned(solved.assignment, solved.marginals.explained_detections, density=solved.density_m2)
+            solved = self._solve_assignment(found.split_visits())
+            again = reassign(solved.assignment, solved.marginals.explained_detections, density=solved.density_m2)
             found = _with_sigma(with_overlooked(again).split_visits(), solved.sigma)
             found = found.without(_seldom(found))
         return found
 
-    def learned_odometry(self, assignment: Assignment) -> FloatArray:
+    def learn_odometry(self, assignment: Assignment) -> FloatArray:
         """Return (5,) noise levels of the odometry by restricted likelihood, given all associations.
 
         Args:
@@ -270,7 +270,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         """
         noise, ahead = self.noise, Extrapolation()
         for _ in range(NOISE_ROUNDS):
-            solved = self._solved(assignment, noise)
+            solved = self._solve_assignment(assignment, noise)
             assignment, smoother = solved.assignment, solved.smoother
             inlier = smoother.inlier_probability(assignment.estimate)
             fit = refine_noise(
@@ -279,9 +279,9 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
             noise = replace(noise, odometry=ahead.ahead(noise, fit.noise).odometry)
         return noise.odometry
 
-    def _judged(self, found: Assignment) -> PlanarSolution:
-        solved = self._solved(found)
-        return self._solved(_with_sigma(solved.assignment, solved.sigma))  # its own noise
+    def _judge(self, found: Assignment) -> PlanarSolution:
+        solved = self._solve_assignment(found)
+        return self._solve_assignment(_with_sigma(solved.assignment, solved.sigma))  # its own noise
 
     def _total(self, solved: PlanarSolution) -> float:
         """Of an unassigned detection as of an outlier; residuals are correlated: `worth` of them count as one."""
@@ -341,7 +341,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         local.update(self._row[known], FrameReadings(problem.reading[known], self._sigma[known]), weighing=GATED)
         if not len(new):
             return
-        at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
+        at = sight_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
         local.update(self._row[new], FrameReadings(problem.reading[new], self._sigma[new]), weighing=GATED)
@@ -369,14 +369,14 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         age = assignment.measured.stamp_s[-1] - assignment.last_seen_s
         return assignment.without(_seldom(assignment) & (age > self._rules.forget_s))
 
-    def _settled(self, assignment: Assignment, sigma: FloatArray, recent: int | None = None) -> PlanarSolution:
+    def _settle(self, assignment: Assignment, sigma: FloatArray, recent: int | None = None) -> PlanarSolution:
         """Solve the batch with the noise (M, 2) of detections, and merge duplicates of all landmarks or of those seen
         last.
         """
-        return self._merged(self._solved(_with_sigma(assignment, sigma)), recent)
+        return self._merged(self._solve_assignment(_with_sigma(assignment, sigma)), recent)
 
-    def _solved_merged(self, solved: PlanarSolution, pairs: list[tuple[int, int]]) -> PlanarSolution:
-        return self._solved(solved.assignment.merged(pairs))
+    def _solve_merged(self, solved: PlanarSolution, pairs: list[tuple[int, int]]) -> PlanarSolution:
+        return self._solve_assignment(solved.assignment.merged(pairs))
 
     def _compared(self, solved: PlanarSolution) -> Solution:
         return compared(solved.assignment, solved.marginals, solved.density_m2)
@@ -385,13 +385,13 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         part = LoosePart.of(solved.assignment, solved.marginals, refused)
         if part is None:
             return []
-        sure = agreed_pairs(
+        sure = list_agreed_pairs(
             part.source, part.target, part.allowed,
             density=solved.density_m2, probability=self._rules.p_merge, settings=self._settings,
         )  # fmt: skip
         return part.rows(sure)
 
-    def _attached(self, solved: PlanarSolution) -> PlanarSolution:
+    def _attach_part(self, solved: PlanarSolution) -> PlanarSolution:
         """Align a loose part with the rest in the best of its ways, if that explains detections of removed ghosts.
 
         No way is certain. But copies of landmarks, removed as ghosts, leave detections that this alignment explains;
@@ -404,7 +404,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         every = overlays(part.source, part.target, part.allowed, density=solved.density_m2, settings=self._settings)
         least = self._total(self._real(solved)) - rules.constellation.certain_nats
         for overlay in every[:REALIGNED]:
-            trial = self._merged(self._solved(solved.assignment.merged(part.rows(overlay.pairs))))
+            trial = self._merged(self._solve_assignment(solved.assignment.merged(part.rows(overlay.pairs))))
             fewer = max(0, solved.assignment.n_landmarks - trial.assignment.n_landmarks)
             against = self._total(self._real(trial)) + rules.landmark_nats * fewer
             if against < least:
@@ -414,9 +414,9 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
     def _real(self, solved: PlanarSolution) -> PlanarSolution:
         """The same without ghosts, at its optimum."""
         real = without_ghosts(solved.assignment)
-        return solved if real.n_landmarks == solved.assignment.n_landmarks else self._solved(real)
+        return solved if real.n_landmarks == solved.assignment.n_landmarks else self._solve_assignment(real)
 
-    def _corrected(self, solved: PlanarSolution, refused: set[tuple[int, int]]) -> PlanarSolution:
+    def _correct_visits(self, solved: PlanarSolution, refused: set[tuple[int, int]]) -> PlanarSolution:
         """Split contradictory visits from their landmarks, and merge again, if the result is better.
 
         Visits that were tried without gain are in `refused`, by first detection and number.
@@ -424,48 +424,48 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         rules = self._rules
 
         def split(parts: list[IntArray]) -> PlanarSolution | None:
-            trial = self._merged(self._solved(now.split(parts)))
+            trial = self._merged(self._solve_assignment(now.split(parts)))
             return trial if _is_better(trial, solved) else None
 
         for _ in range(SPLIT_ROUNDS):
             now = solved.assignment
             linear = solved.smoother.detections(now.estimate)
-            visits = weighed_visits(now, solved.marginals, linear, density=solved.density_m2)
+            visits = weigh_visits(now, solved.marginals, linear, density=solved.density_m2)
             doubtful = visits.evidence < math.log(rules.p_merge / (1.0 - rules.p_merge))
             by_traits = visits.by_traits < -rules.readings.misread_nats
             doubtful &= (visits.squared > gates(1, rules.contradiction)[1]) | by_traits
             order = np.flatnonzero(doubtful)[np.argsort(visits.evidence[doubtful], kind="stable")]
             _, first = np.unique(visits.landmark[order], return_index=True)  # one of each landmark
             parts = [visits.rows[k] for k in order[np.sort(first)] if _key(visits.rows[k]) not in refused]
-            better = tried_by_halves(parts, split, lambda part: refused.add(_key(part)))
+            better = try_by_halves(parts, split, lambda part: refused.add(_key(part)))
             if better is None:
                 break
             solved = better
         return solved
 
-    def _realigned(self, solved: PlanarSolution) -> PlanarSolution:
+    def _realign(self, solved: PlanarSolution) -> PlanarSolution:
         """Realign displaced stretches, if the result is better."""
         for _ in range(REALIGNED):
             now = solved.assignment
             trusted = now.sightings >= self._settings.fewest_sightings
-            stretches = displaced_stretches(
+            stretches = find_displaced(
                 now, solved.marginals, trusted, density=solved.density_m2, probability=self._rules.p_merge
             )
             starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
-            trials = (self._merged(self._solved(start)) for start in starts)
+            trials = (self._merged(self._solve_assignment(start)) for start in starts)
             better = next((trial for trial in trials if _is_better(trial, solved)), None)
             if better is None:
                 break
-            solved = self._corrected(better, set())
+            solved = self._correct_visits(better, set())
         return solved
 
-    def _solved(self, assignment: Assignment, noise: Noise | None = None) -> PlanarSolution:
+    def _solve_assignment(self, assignment: Assignment, noise: Noise | None = None) -> PlanarSolution:
         """Optimum, covariances and cost, and the noise of sightings that its residuals show."""
         problem = assignment.problem()
         noise = self.noise if noise is None else noise
         smoother = Smoother(problem, noise, heavy=True)
-        slices = smoother.solved_in_slices(assignment.estimate, iterations=8, tolerance=1e-3, settled=0.1)
-        estimate, marginals = exhausted(slices)
+        slices = smoother.solve_in_slices(assignment.estimate, iterations=8, tolerance=1e-3, settled=0.1)
+        estimate, marginals = exhaust(slices)
         measured = assignment.measured
         given = self._problem.sigma_given[: len(measured.pose_row)]
         unknown = replace(problem, sigma_given=given[assignment.landmark_row >= 0])
@@ -505,7 +505,7 @@ def compared(assignment: Assignment, marginals: Marginals, density: float) -> So
     n_frames, around = len(assignment.measured.stamp_s), settings.around_frames
     return Solution(
         place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
-        *seen_together(frame, row, n_frames, len(place), around), kind, settings,
+        *count_together(frame, row, n_frames, len(place), around), kind, settings,
     )  # fmt: skip
 
 

@@ -28,12 +28,12 @@ from evermap.slam.association.assignment import (
     NOBODY,
     LooseDetections,
     alike,
+    count_together,
     density_of_unmet,
     labels_of,
     landmark_density,
-    merged_rows,
+    merge_rows,
     same_name,
-    seen_together,
     shared_variance,
 )
 from evermap.slam.association.associator import Associator, with_traits
@@ -47,7 +47,7 @@ from evermap.slam.association.merging import (
     in_reach,
 )
 from evermap.slam.association.revise import lying_together, may_be_of, most_probable
-from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
+from evermap.slam.space.estimate import as_seen, converge, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem, Swing
@@ -60,7 +60,7 @@ ROUNDS = 2
 """Rounds of learning the noise with a kernel whose influence never vanishes, as far from convergence."""
 
 
-def associated_in_space(recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False) -> Associated:
+def associate_in_space(recording: SpatialRecording, settings: SlamConfig, *, keep_ids: bool = False) -> Associated:
     """Associate a recording in space; as `associate`.
 
     Boxes (of a detector of movable objects) and detections without a range are of no landmark.
@@ -233,7 +233,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         traits: Traits | None = None,
         known: SpatialSolution | None = None,
     ) -> None:
-        problem = self._problem = _thinned(intake)
+        problem = self._problem = _thin_poses(intake)
         density = density_of_unmet(np.zeros((0, 3)), settings) if known is None else known.density
         super().__init__(problem.stamp_s, problem.pose_row, kind, _Nearby(), density, traits, settings)
         caution, space = self._rules.odometry_caution, problem.settings
@@ -243,16 +243,18 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         self._at = se3.transform(mount, problem.measured[:, :3])
         self._root = self._rules.noise_caution * se3.rotation_of(mount) @ np.linalg.inv(problem.measured_root)
         self._ways = se3.compose(mount, problem.either)
-        self._turned = problem.kind != POINT
+        self._turn_axes = problem.kind != POINT
         self._view = np.unique(problem.pose_row * len(problem.mount) + problem.sensor, return_inverse=True)[1]
 
     def _begun(self, begun: SpatialSolution | None) -> SpatialSolution:
         if begun is not None:
-            return self._solved(SpatialAssignment(begun.landmark_row, begun.estimate.pose, self._noise, begun.traits))
+            return self._solve_assignment(
+                SpatialAssignment(begun.landmark_row, begun.estimate.pose, self._noise, begun.traits)
+            )
         start = SpatialAssignment(self._row, accumulate(self._problem.increment), self._noise, self._traits)
         return self._with_noise(start.rows(self._row))
 
-    def _reassigned(self, solved: SpatialSolution) -> SpatialAssignment:
+    def _reassign(self, solved: SpatialSolution) -> SpatialAssignment:
         again = self._with_overlooked(self._most_probable(solved), solved)
         again = _without(again, np.bincount(again[again >= 0]) < self._settings.fewest_sightings)
         return SpatialAssignment(again, solved.estimate.pose, solved.noise, solved.traits)
@@ -263,8 +265,10 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
     def _result(self, solved: SpatialSolution) -> SpatialSolution:
         return solved
 
-    def _judged(self, found: SpatialSolution) -> SpatialSolution:
-        return self._solved(SpatialAssignment(found.landmark_row, found.estimate.pose, self._noise, found.traits))
+    def _judge(self, found: SpatialSolution) -> SpatialSolution:
+        return self._solve_assignment(
+            SpatialAssignment(found.landmark_row, found.estimate.pose, self._noise, found.traits)
+        )
 
     def _total(self, solved: SpatialSolution) -> float:
         """An unassigned detection is of one of the landmarks that there are elsewhere, as in `_most_probable`."""
@@ -283,7 +287,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         )
         row = np.where(np.isin(solved.landmark_row, kept), np.searchsorted(kept, solved.landmark_row), NOBODY)
         views = int(self._view.max(initial=-1)) + 1
-        together, _ = seen_together(self._view, row, views, len(kept), 0)
+        together, _ = count_together(self._view, row, views, len(kept), 0)
         some = np.flatnonzero((row == NOBODY) & (self._kind[:, -1] == UNKNOWN))
         at = se3.transform(solved.estimate.pose[self._problem.pose_row[some]], self._at[some])
         loose = LooseDetections(some, at, self._wide_m(solved.noise)[some], self._kind[some, 0])
@@ -299,7 +303,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         width = np.where(turned, 6, 3)
         own = block_diag(*np.where(turned[:, None, None], se3.rotation_of(place), np.eye(3)))
         at = ((np.cumsum(width) - width)[:, None] + np.arange(3)).ravel()
-        covariance = own @ joint[np.ix_(at, at)] @ own.T + np.diag(np.repeat(self._shared_m2(solved)[rows], 3))
+        covariance = own @ joint[np.ix_(at, at)] @ own.T + np.diag(np.repeat(self._find_shared_m2(solved)[rows], 3))
         told = turned & (problem.symmetries.of[rows] == 0)  # what looks the same in several has none
         return LocalMap(place[:, :3], covariance, np.where(told[:, None], place[:, 3:], np.nan))
 
@@ -323,7 +327,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         spread = near.covariance[at[:, :, None], at[:, None, :]] + own[source]
         squared = np.einsum("ki,ki->k", innovation, np.linalg.solve(spread, innovation[..., None])[..., 0])
         inside = squared <= gates(1, rules.gate_confidence, 3)[1]
-        inside[inside] = self._turned_alike(view[source[inside]], near, target[inside])
+        inside[inside] = self._turn_alike(view[source[inside]], near, target[inside])
         source, target, innovation, spread = source[inside], target[inside], innovation[inside], spread[inside]
         rows = se2.xy_rows(target, 3)
         joint = near.covariance[np.ix_(rows, rows)].reshape(len(source), 3, len(source), 3)
@@ -350,13 +354,13 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
     def _loose(self, solved: SpatialSolution, refused: set[tuple[int, int]]) -> list[tuple[int, int]]:  # noqa: ARG002
         return []
 
-    def _corrected(self, solved: SpatialSolution, refused: set[tuple[int, int]]) -> SpatialSolution:  # noqa: ARG002
+    def _correct_visits(self, solved: SpatialSolution, refused: set[tuple[int, int]]) -> SpatialSolution:  # noqa: ARG002
         return solved
 
-    def _realigned(self, solved: SpatialSolution) -> SpatialSolution:
+    def _realign(self, solved: SpatialSolution) -> SpatialSolution:
         return solved
 
-    def _turned_alike(self, detection: IntArray, near: _Nearby, target: IntArray) -> BoolArray:
+    def _turn_alike(self, detection: IntArray, near: _Nearby, target: IntArray) -> BoolArray:
         """(K,) detections with the orientation of landmarks, in one of the two possible poses of either."""
         away_s = self._problem.stamp_s[self._problem.pose_row[detection]] - self._seen_s[near.row[target]]
         sigma = np.hypot(self._noise.rotation * np.sqrt(away_s), near.sigma_rad[target])
@@ -369,39 +373,39 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         mine = np.repeat(self._ways[:, detection], 2, axis=0)
         angle = symmetries.angle_between(mine, np.concatenate([ways, ways])).min(axis=0)
         sigma = np.hypot(np.hypot(sigma, self._problem.sigma_rad[detection]), rules.turn_floor_rad)
-        return np.asarray(~turned | ~self._turned[detection] | (angle <= rules.turn_sigmas * sigma))
+        return np.asarray(~turned | ~self._turn_axes[detection] | (angle <= rules.turn_sigmas * sigma))
 
     def _update(self, known: IntArray, new: IntArray) -> None:
         near, seen = self._near, np.append(known, new)
         near.meet(self._row[new])
         at = np.searchsorted(near.row, self._row[seen])
         near.update(at, self._at[seen], self._covariance(seen, self._noise))
-        sigma = np.where(self._turned[seen], self._problem.sigma_rad[seen], 0.0)
+        sigma = np.where(self._turn_axes[seen], self._problem.sigma_rad[seen], 0.0)
         near.ways[:, at], near.sigma_rad[at] = self._ways[:, seen], sigma
 
     def _with_noise(self, start: SpatialAssignment) -> SpatialSolution:
         """Solve for landmarks and noise, from poses that may be far off and noise levels."""
         problem = self._problem_of(start.landmark_row)
         places = first_places(problem, start.pose)
-        points = converged(problem.as_points(), places, start.noise, heavy_rounds=ROUNDS)
+        points = converge(problem.as_points(), places, start.noise, heavy_rounds=ROUNDS)
         noise = points.noise
         if problem.oriented.any():
             problem, turned = _one_way(problem, points.estimate, points.now.weight)
-            noise = converged(problem, turned, noise, heavy_rounds=ROUNDS).noise
+            noise = converge(problem, turned, noise, heavy_rounds=ROUNDS).noise
         caution = self._rules.odometry_caution
         noise = replace(noise, translation=caution * noise.translation, rotation=caution * noise.rotation)
-        return self._solved(start._replace(pose=points.estimate.pose, noise=noise))
+        return self._solve_assignment(start._replace(pose=points.estimate.pose, noise=noise))
 
     def _problem_of(self, row: IntArray) -> SpatialProblem:
         """The measurements of landmarks (M,)."""
         problem, used = self._problem, np.flatnonzero(row >= 0)
         first = np.unique(row[used], return_index=True)[1]
         turned = np.zeros(len(first), dtype=np.bool_)
-        turned[row[used][self._turned[used]]] = True
+        turned[row[used][self._turn_axes[used]]] = True
         symmetries = problem.symmetries[problem.place[used[first]]]
         return replace(problem.seeing(used), place=row[used], oriented=turned, symmetries=symmetries)
 
-    def _solved(self, start: SpatialAssignment) -> SpatialSolution:
+    def _solve_assignment(self, start: SpatialAssignment) -> SpatialSolution:
         """Solve for landmarks, from poses that may be far off: positions first, then orientations, too."""
         row, pose, noise, traits = start
         problem = self._problem_of(row)
@@ -418,10 +422,10 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         cost = now.cost - traits.evidence(*self.of_visits(start))
         return SpatialSolution(row, estimate, smoother, now, noise, density, traits, cost)
 
-    def _solved_merged(self, solved: SpatialSolution, pairs: list[tuple[int, int]]) -> SpatialSolution:
-        row = np.append(merged_rows(pairs, solved.n_landmarks), NOBODY)[solved.landmark_row]
+    def _solve_merged(self, solved: SpatialSolution, pairs: list[tuple[int, int]]) -> SpatialSolution:
+        row = np.append(merge_rows(pairs, solved.n_landmarks), NOBODY)[solved.landmark_row]
         start = SpatialAssignment(row, solved.estimate.pose, solved.noise, solved.traits)
-        return self._solved(start.rows(row))
+        return self._solve_assignment(start.rows(row))
 
     def _compared(self, solved: SpatialSolution) -> Solution:
         rules = self._rules
@@ -440,14 +444,14 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         log_density = np.log(solved.density * like)
         factorised = solved.smoother.factorised(solved.now)
         known = solved.traits, self._likeness(solved)
-        differences = _Differing(solved, factorised, self._shared_m2(solved), log_density, of, *known, rules)
+        differences = _Differing(solved, factorised, self._find_shared_m2(solved), log_density, of, *known, rules)
         n_views = int(self._view.max()) + 1
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
-            *seen_together(self._view[used], row, n_views, count, rules.around_frames), of, rules,
+            *count_together(self._view[used], row, n_views, count, rules.around_frames), of, rules,
         )  # fmt: skip
 
-    def _shared_m2(self, solved: SpatialSolution) -> FloatArray:
+    def _find_shared_m2(self, solved: SpatialSolution) -> FloatArray:
         """(L,) `shared_variance` of the landmarks."""
         return shared_variance(self._wide_m(solved.noise), solved.landmark_row, len(solved.estimate.place), self._rules)
 
@@ -461,7 +465,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self._covariance(slice(None), noise))[:, 2]))
 
     def _most_probable(self, solved: SpatialSolution) -> IntArray:
-        """(M,) the most probable landmark of every detection, given all poses; see `revise.reassigned`."""
+        """(M,) the most probable landmark of every detection, given all poses; see `revise.reassign`."""
         rules, of_space = self._rules, self._rules.space
         tail_by, tail_share, widened = of_space.tail, of_space.tail_share, of_space.widened
         pose, place = solved.estimate.pose[self._problem.pose_row], solved.estimate.place
@@ -530,7 +534,7 @@ class _Differing:
         problem = self.solved.smoother.problem
         both = problem.oriented[younger] & problem.oriented[older]
         dim = 6 if both.any() else 3
-        gap, by = self._linearised(younger, older, both)
+        gap, by = self._linearise_gaps(younger, older, both)
         rows, at = np.unique(np.concatenate([younger, older]), return_inverse=True)
         width = np.where(problem.oriented[rows], 6, 3)
         first = np.cumsum(width) - width
@@ -561,7 +565,7 @@ class _Differing:
         new += 0.0 if dim == 6 else 1.5 * math.log(2.0 * math.pi)
         return Differences(gap[:, :dim], own[:, :dim, :dim], new, together)
 
-    def _linearised(self, younger: IntArray, older: IntArray, both: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def _linearise_gaps(self, younger: IntArray, older: IntArray, both: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Gaps (K, 6), and their derivatives (K, 6, 12) by the two."""
         gap, by = np.zeros((len(younger), 6)), np.zeros((len(younger), 6, 12))
         problem, place = self.solved.smoother.problem, self.solved.estimate.place
@@ -599,7 +603,7 @@ def _one_way(
     return replace(problem, kind=kind, measured=measured), estimate
 
 
-def _thinned(intake: SpatialIntake) -> SpatialProblem:
+def _thin_poses(intake: SpatialIntake) -> SpatialProblem:
     """The problem with only the poses that have detections."""
     problem = intake.problem
     kept = np.unique(problem.pose_row)

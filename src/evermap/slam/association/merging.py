@@ -70,7 +70,7 @@ class Solution:
         covariance: (L, 2, 2) or (L, 3, 3) of each by itself.
         differences: returns those of pairs, by rows (K,) of the younger and (K,) of the older ones.
         sightings, last_seen_s: (L,) number of detections, stamp of the last.
-        together, in_turn: (L, L) numbers of frames, see `seen_together`.
+        together, in_turn: (L, L) numbers of frames, see `count_together`.
         kind: (L, P) class and name of each, `UNKNOWN` for none: different ones exclude each other.
         settings: of the association.
     """
@@ -128,11 +128,11 @@ def propose_merges(
         found = solution.differences(younger[rows], older[rows])
         for mine, begin in zip(some, first.tolist(), strict=False):
             part = found.part(begin, begin + len(mine))
-            merges += _agreed(solution, younger[mine], older[mine], part, probability, last=last)
+            merges += _list_agreeing(solution, younger[mine], older[mine], part, probability, last=last)
     return _without_contradictions(sorted(set(merges)), solution.kind)
 
 
-def accepted_rise(
+def find_most_rise(
     pairs: list[tuple[int, int]], sightings: IntArray, numbers: int | IntArray, settings: AssociationConfig
 ) -> float:
     """Return the rise of the cost that merging pairs may cause [nats].
@@ -168,14 +168,14 @@ def merge_while_any(
         pairs = propose(solved, refused)
         if not pairs:
             break
-        merged = tried_by_halves(pairs, functools.partial(merge, solved), refused.add)
+        merged = try_by_halves(pairs, functools.partial(merge, solved), refused.add)
         if merged is not None:
             refused.clear()
             solved = merged
     return solved
 
 
-def tried_by_halves(
+def try_by_halves(
     parts: list[_Part], attempt: Callable[[list[_Part]], _Result | None], refuse: Callable[[_Part], object]
 ) -> _Result | None:
     """Try all parts, or half of them, and so on, until the attempt gives a result; a single part may be refused."""
@@ -235,7 +235,7 @@ def _near(solution: Solution, sources: IntArray, targets: IntArray) -> IntArray:
     return np.column_stack([np.maximum(one, two), np.minimum(one, two)])
 
 
-def _agreed(
+def _list_agreeing(
     solution: Solution, younger: IntArray, older: IntArray, found: Differences, probability: float, *, last: bool
 ) -> list[tuple[int, int]]:
     """Pairs (younger, older) of a group that are the same with certainty."""

@@ -22,7 +22,7 @@ from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.features import Likeness, Traits, Variances, same_nats
 from evermap.slam.association.jcbb import gates
 from evermap.slam.batch import USUAL
-from evermap.slam.calibration import seated
+from evermap.slam.calibration import seat_sensor
 from evermap.slam.filter_kernels import vectorised
 from evermap.slam.kernels import N_STATES, composed, kernel, wrapped
 from evermap.slam.problem import Estimate
@@ -145,7 +145,7 @@ def drawn(
         _Rules.of(settings),
     )  # fmt: skip
     cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count), settings)
-    row, pose, evidence = _run(seen, _Sensor(seated(problem.mount, states), states), steps, noise, cloud, seed)
+    row, pose, evidence = _run(seen, _Sensor(seat_sensor(problem.mount, states), states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
     estimate = Estimate(pose, np.zeros((len(met), 2)), states.copy())
     found = replace(assignment, landmark_row=row, estimate=estimate)

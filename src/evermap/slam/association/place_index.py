@@ -20,7 +20,7 @@ from evermap.config import ConstellationConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.geometry.group import SPACE, group_of
 from evermap.geometry.rigid import rigid
-from evermap.slam.association.constellation import MAX_MOTIONS, LocalMap, agreed_pairs
+from evermap.slam.association.constellation import MAX_MOTIONS, LocalMap, list_agreed_pairs
 from evermap.slam.batch import USUAL
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -124,7 +124,7 @@ class PlaceIndex:
         area_m2 = float(np.prod(np.ptp(self._position, axis=0)))
         elsewhere = math.log(max(1.0, area_m2 / (2.0 * math.pi * rules.free_m * rules.free_m)))
         margins = rules.certain_nats + elsewhere, rules.lead_nats
-        found = self._agreed(local, places, list(motions), density, probability, margins)
+        found = self._list_agreeing(local, places, list(motions), density, probability, margins)
         return [(int(rows[k]), m) for k, m in found] if len(found) >= fewest else []
 
     def _further(
@@ -143,7 +143,7 @@ class PlaceIndex:
             motion = rigid(source.place[at[near]], self._position[to[near]])
             rows = np.append(at[near], new)
             places = self.around(se2.transform(motion, source.place[rows]), self._rules.reach_m)
-            pairs = self._agreed(source.part(rows), places, [motion], density, probability)
+            pairs = self._list_agreeing(source.part(rows), places, [motion], density, probability)
             fresh = [(int(rows[k]), m) for k, m in pairs if k >= len(near) and m not in to]
             if fresh:
                 found += fresh
@@ -155,17 +155,17 @@ class PlaceIndex:
         near: Any = self._tree.query_ball_point(at_m, reach_m)
         return np.unique(np.fromiter(itertools.chain.from_iterable(near), dtype=np.int64))
 
-    def _agreed(
+    def _list_agreeing(
         self, local: LocalMap, places: IntArray, motions: list[FloatArray], density: float, probability: float,
         margins_nats: tuple[float, float] | None = None,
     ) -> list[tuple[int, int]]:  # fmt: skip
-        """Pairs (row of `local`, row of the map) that are certain, among some places; see `agreed_pairs`."""
+        """Pairs (row of `local`, row of the map) that are certain, among some places; see `list_agreed_pairs`."""
         joint = np.zeros((len(places), 2, len(places), 2))
         rows = np.arange(len(places))
         joint[rows, :, rows, :] = self._covariance[places]
         target = LocalMap(self._position[places], joint.reshape(2 * len(places), 2 * len(places)))
         allowed = np.ones((len(local.place), len(places)), dtype=bool)
-        pairs = agreed_pairs(
+        pairs = list_agreed_pairs(
             local, target, allowed, density=density, probability=probability, motions=motions,
             margins_nats=margins_nats, settings=self._settings,
         )  # fmt: skip

@@ -32,7 +32,7 @@ HIDDEN = np.geomspace(0.01, 0.8, 12)
 """Grid of the probability of a landmark in view to be hidden for a while; the least is that of a hit out of view."""
 
 
-def reassigned(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
+def reassign(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
     """Return the assignment with every detection assigned to its most probable landmark, or to none.
 
     Args:
@@ -181,7 +181,7 @@ def likely_real(assignment: Assignment) -> BoolArray:
     """
     if not (assignment.landmark_row >= 0).any():
         return np.ones(assignment.n_landmarks, dtype=bool)
-    return _looked_at(assignment).real
+    return _count_views(assignment).real
 
 
 def unseen_nats(assignment: Assignment) -> float:
@@ -196,7 +196,7 @@ def unseen_nats(assignment: Assignment) -> float:
     if not used.any():
         return 0.0
     rules, measured, estimate = assignment.settings.association, assignment.measured, assignment.estimate
-    look = _looked_at(assignment)
+    look = _count_views(assignment)
     when = ((measured.stamp_s - measured.stamp_s[0]) // rules.forget_s).astype(np.int64)
     expected = _expected(estimate.pose, estimate.landmark, look.edges, look.view, look.rate, when)
     seen = np.zeros(expected.shape, dtype=np.bool_)
@@ -215,7 +215,7 @@ class _Visible(NamedTuple):
     view: FloatArray
 
 
-def _looked_at(assignment: Assignment) -> _Visible:
+def _count_views(assignment: Assignment) -> _Visible:
     """Which landmarks are seen often enough in view, and how often these are."""
     real, used = np.ones(assignment.n_landmarks, dtype=bool), assignment.landmark_row >= 0
     measured, estimate, least = assignment.measured, assignment.estimate, assignment.settings.association.least_seen

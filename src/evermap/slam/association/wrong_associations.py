@@ -63,7 +63,7 @@ class Visits(NamedTuple):
     evidence: FloatArray
 
 
-def weighed_visits(assignment: Assignment, marginals: Marginals, linear: FloatArray, *, density: float) -> Visits:
+def weigh_visits(assignment: Assignment, marginals: Marginals, linear: FloatArray, *, density: float) -> Visits:
     """Weigh each visit against the estimate without it.
 
     Args:
@@ -145,7 +145,7 @@ class Displaced(NamedTuple):
     motion: FloatArray
 
 
-def displaced_stretches(
+def find_displaced(
     assignment: Assignment, marginals: Marginals, trusted: BoolArray, *, density: float, probability: float
 ) -> list[Displaced]:
     """Return stretches of consecutive landmarks with the constellation of older ones; those with most landmarks first.

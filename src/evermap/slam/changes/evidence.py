@@ -19,8 +19,8 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from evermap.config import RangesConfig
 from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
-from evermap.slam.batch import middles, sighted_at
-from evermap.slam.calibration import SLOPE, CalibrationPrior, seated
+from evermap.slam.batch import middles, sight_at
+from evermap.slam.calibration import SLOPE, CalibrationPrior, seat_sensor
 from evermap.slam.kernels import N_STATES
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.ranges import Ranged, locate_by_ranges
@@ -85,7 +85,7 @@ class WindowEvidence:
             pull=self.pull[rows] - cross @ solved[:, -1],
         )
 
-    def softened(self, sigma_m: float) -> WindowEvidence:
+    def soften(self, sigma_m: float) -> WindowEvidence:
         """Return the evidence with an error of its own in every copy: errors of sightings are correlated."""
         if sigma_m == 0.0:
             return self
@@ -162,7 +162,7 @@ def landmark_evidence(
         here = estimate if row is None else replace(estimate, landmark=estimate.landmark[row[w]])
         piece = yield from _piece(problem, here, noise, held, (bounds[w], bounds[w + 1], fewest), ranges, sized=sized)
         pieces.append(piece)
-    information, right, at_pose = _joined(pieces)
+    information, right, at_pose = _join_windows(pieces)
     yield dense_ms(len(right))
     states = np.arange(len(right) - N_STATES, len(right))
     information[states, states] += 1.0 / held.sigma**2
@@ -194,7 +194,7 @@ def landmark_evidence(
     )
 
 
-def _joined(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, int]:
+def _join_windows(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, int]:
     """Return the normal equations of all windows, and the first row of a pose.
 
     Unknowns are copies of landmarks, poses between windows and calibration states, in this order.
@@ -299,7 +299,7 @@ def _piece(
         landmark_information=sparse.csr_array((2 * count, 2 * count)),
         measurements=tuple(tied.among(start, last) for tied in problem.measurements if tied.kind.ties != "pose_place"),
     )
-    sighted = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
+    sighted = sight_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
     position = middles(part.landmark_row, sighted, count)  # of the landmarks by the poses of this window alone
     # ranges alone are linear near where it is only. One bearing of a landmark is a first value (`slam.ranges`), which a
     # map knows better; without one the estimate is no better than that
@@ -328,7 +328,7 @@ def _move_to_ranges(
     """
     part, position = smoother.problem, estimate.landmark.copy()
     weights = smoother.inlier_probability(estimate)
-    eye = se2.compose(estimate.pose, seated(part.mount, estimate.states))[part.pose_row, :2]
+    eye = se2.compose(estimate.pose, seat_sensor(part.mount, estimate.states))[part.pose_row, :2]
     range_m, sigma_m = np.linalg.norm(sighted - eye, axis=1), part.find_sigma(smoother.noise)[:, 0]
     for k in np.flatnonzero(ranged):
         mine = np.flatnonzero(part.landmark_row == k)
@@ -351,7 +351,7 @@ def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:
     if prior.without_scale() is prior:
         return estimate
     grow = (1.0 + estimate.states[SLOPE]) / (1.0 + prior.mean[SLOPE])
-    states = prior.resized(estimate.states, grow)
+    states = prior.resize(estimate.states, grow)
     centre = estimate.landmark[estimate.known].mean(axis=0)
     pose = estimate.pose.copy()
     pose[:, :2] = centre + grow * (pose[:, :2] - centre)

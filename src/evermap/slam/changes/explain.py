@@ -19,7 +19,7 @@ from evermap.estimate.sparse.system import Slices
 from evermap.geometry import se2
 from evermap.slam.changes.gain import spread_of
 from evermap.slam.kernels import N_SENSOR, detection_residual, kernel
-from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
+from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embed, independent, padded
 from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -119,14 +119,14 @@ def explained(
             landmark[members] = group.moved(mean)
             mean[members] += offset
             tied = np.linalg.inv(own + motion_covariance) - between_rows(information, rows).toarray()
-            information = sparse.csr_array(information + embedded(tied, rows, 2 * len(places)))
+            information = sparse.csr_array(information + embed(tied, rows, 2 * len(places)))
             continue
         new = len(places) + np.arange(len(members))
         places.extend(int(j) for j in members)
         tie = np.linalg.inv(motion_covariance + prior.rigid_m**2 * np.eye(2 * len(members)))
         both = se2.xy_rows(np.append(members, new))
         information = padded(information, len(new))
-        parted = embedded(np.kron([[1.0, -1.0], [-1.0, 1.0]], tie), both, 2 * len(places))
+        parted = embed(np.kron([[1.0, -1.0], [-1.0, 1.0]], tie), both, 2 * len(places))
         information = sparse.csr_array(information + parted)
         mean = np.vstack([mean, mean[members] + offset])
         landmark = np.vstack([landmark, group.moved(landmark[:count])])
@@ -143,7 +143,7 @@ HELD_M = 0.005
 """To this the other landmarks are held meanwhile."""
 
 
-def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Slices[Estimate]:
+def unsway(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Slices[Estimate]:
     """Return the estimate with poses that are not distorted by sightings of the members, in slices.
 
     Sightings that were given to the wrong places have drawn the poses towards these, and would be right again there.
@@ -155,7 +155,7 @@ def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArr
         landmark_information=independent(np.tile(np.eye(2) / HELD_M**2, (len(problem.landmark_mean), 1, 1))),
     )
     start = Estimate(estimate.pose, estimate.landmark[: len(problem.landmark_mean)], estimate.states)
-    free, _ = yield from Smoother(rest, noise, heavy=True).solved_in_slices(start, iterations=5, tolerance=1e-4)
+    free, _ = yield from Smoother(rest, noise, heavy=True).solve_in_slices(start, iterations=5, tolerance=1e-4)
     return Estimate(free.pose, estimate.landmark, free.states)
 
 

@@ -282,13 +282,13 @@ def _products(
         f = first[g]
         for t in range(width[g] - point_dim):
             _displace(turning[t], centre[g], by)
-            right[f + point_dim + t] -= _weighted(by, right, f)
+            right[f + point_dim + t] -= _sum_weighted(by, right, f)
             for k in range(total):
-                matrix[f + point_dim + t, k] -= _weighted(by, matrix[:, k], f)
+                matrix[f + point_dim + t, k] -= _sum_weighted(by, matrix[:, k], f)
         for t in range(width[g] - point_dim):
             _displace(turning[t], centre[g], by)
             for k in range(total):
-                matrix[k, f + point_dim + t] -= _weighted(by, matrix[k], f)
+                matrix[k, f + point_dim + t] -= _sum_weighted(by, matrix[k], f)
     return width, first, matrix, right, prior
 
 
@@ -302,7 +302,7 @@ def _displace(turning: FloatArray, point: FloatArray, by: FloatArray) -> None:
 
 
 @kernel
-def _weighted(by: FloatArray, values: FloatArray, first: int) -> float:
+def _sum_weighted(by: FloatArray, values: FloatArray, first: int) -> float:
     """Sum of values from the first on, as many as there are weights; some of these are 0."""
     total = 0.0
     for a in range(len(by)):

@@ -17,8 +17,8 @@ from scipy import sparse
 
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import SlamConfig
-from evermap.estimate.sparse.system import Slices, exhausted
-from evermap.slam.batch import outvoted
+from evermap.estimate.sparse.system import Slices, exhaust
+from evermap.slam.batch import outvote
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import (
     Comparison,
@@ -28,7 +28,7 @@ from evermap.slam.changes.evidence import (
     in_sensor_metres,
     landmark_evidence,
 )
-from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
+from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unsway
 from evermap.slam.changes.search import item_columns
 from evermap.slam.changes.weigh import ChangePosterior, weigh
 from evermap.slam.method import Compare, Explanation, Method, Rival
@@ -68,7 +68,7 @@ class Joint(Method):
         self._count, self._calibration, self._given = n_landmarks, calibration, given
         self._prior, self._robust, self._fewest = settings.changes, settings.robust, settings.fewest_sightings
         self._ranges = settings.ranges
-        self._loosened: _Loosened | None = None
+        self._loosen: _Loosened | None = None
         self._concluded: Explanation | None = None
         self._landmark = np.arange(n_landmarks)
         self._groups: Groups = ()
@@ -85,7 +85,7 @@ class Joint(Method):
         """Return False where there is neither a map nor, for so many landmarks, more than one window."""
         return self._in_map(problem) or self._count <= MOST_ITEMS // 2
 
-    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+    def unprejudice(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """Return the problem with the map believed to 1 m: a wrong one bends the solution or looks noisy."""
         if self._given is None or not self._in_map(problem):
             return problem, estimate
@@ -102,8 +102,8 @@ class Joint(Method):
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
         weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
         unmapped = replace(free, landmark_information=sparse.csr_array(free.landmark_information.shape))
-        self._loosened = _Loosened(problem, free, outvoted(unmapped, start, weights, self._fewest))
-        return free, self._loosened.start
+        self._loosen = _Loosened(problem, free, outvote(unmapped, start, weights, self._fewest))
+        return free, self._loosen.start
 
     def _where_most_agree(self, estimate: Estimate) -> Estimate:
         """The whole moved to where most landmarks are at their places: those seen first may have been the others."""
@@ -121,7 +121,7 @@ class Joint(Method):
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Return what `revise_in_slices` does."""
-        return exhausted(self.revise_in_slices(problem, estimate, noise, heavy=heavy, final=final))
+        return exhaust(self.revise_in_slices(problem, estimate, noise, heavy=heavy, final=final))
 
     def revise_in_slices(
         self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool
@@ -131,9 +131,9 @@ class Joint(Method):
             return replace(self._concluded, problem=problem, estimate=estimate)
         if final:
             self.posterior = None  # hypotheses found on the way are not assumed
-            if self._loosened is not None:
+            if self._loosen is not None:
                 # what has not been explained yet may look like outliers on the wrong side: none is ruled out here
-                problem, free, start = self._loosened
+                problem, free, start = self._loosen
                 smoother = Smoother(free, noise, heavy=True, robust=self._robust)
                 estimate = smoother.optimum(start, iterations=10, tolerance=1e-4)
                 # what moved has turned the whole, too: linear evidence of ranges would not turn it back
@@ -163,17 +163,17 @@ class Joint(Method):
                 return Explanation(problem, estimate, self._current())
             # the search may find the map better than it says; the solution does not build on that
             believed = replace(given, covariance=given.covariance * max(posterior.map_factor, 1.0) ** 2)
-            problem, start, self._landmark = self._explained(base, estimate, evidence, believed, groups)
+            problem, start, self._landmark = self._explain_moves(base, estimate, evidence, believed, groups)
             # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
             smoother = Smoother(problem, noise, heavy=True, robust=self._robust)
-            estimate, _ = yield from smoother.solved_in_slices(start, iterations=5, tolerance=1e-4)
+            estimate, _ = yield from smoother.solve_in_slices(start, iterations=5, tolerance=1e-4)
             if settled:
                 break
         if in_map:
             self._given = given
         if not heavy:
             lighter = smoother.under(noise, heavy=False)
-            estimate, _ = yield from lighter.solved_in_slices(estimate, iterations=5, tolerance=1e-4)
+            estimate, _ = yield from lighter.solve_in_slices(estimate, iterations=5, tolerance=1e-4)
         light = smoother.under(noise, heavy=False)
         changes = self._changes(self._groups, posterior.probability, base, light, estimate)
         revision = Explanation(problem, estimate, self._current(), changes)
@@ -208,7 +208,7 @@ class Joint(Method):
                     row[np.ix_(start_s >= group.since_s, group.members)] = current[group.members]
         return row
 
-    def _explained(
+    def _explain_moves(
         self, base: Problem, estimate: Estimate, evidence: WindowEvidence, believed: GivenMap, groups: Groups
     ) -> tuple[Problem, Estimate, IntArray]:
         """The problem in a world where these groups moved, a start, and the landmark of every place."""
@@ -234,8 +234,8 @@ class Joint(Method):
         for found, probability in self.posterior.alternatives[: self._prior.most_rivals]:
             if probability < self.posterior.probability * math.exp(-self._prior.rival_nats):
                 break
-            groups = exhausted(self._all_timed(found, base, estimate, noise, evidence, bounds))
-            problem, start, landmark = self._explained(base, estimate, evidence, believed, groups)
+            groups = exhaust(self._all_timed(found, base, estimate, noise, evidence, bounds))
+            problem, start, landmark = self._explain_moves(base, estimate, evidence, believed, groups)
             smoother = Smoother(problem, noise, robust=self._robust)
             solved = smoother.optimum(start, iterations=5, tolerance=1e-4)
             current = _current(landmark, self._count)
@@ -256,7 +256,7 @@ class Joint(Method):
         posterior = yield from weigh(evidence, given, self._prior, n_windows, before=self.posterior, thorough=thorough)
         if not given.given.any():
             return posterior, given
-        soft = evidence.softened(self._prior.usual_softness_m)
+        soft = evidence.soften(self._prior.usual_softness_m)
         yield dense_ms(len(soft.pull))
         while True:
             comparison = compare(soft, given.mean, given.covariance, given.given)
@@ -333,7 +333,7 @@ class Joint(Method):
         if not any(begun.same_as(solved) for solved in self._groups):  # poses of another time would vote for it
             return begun
         old = estimate.landmark[: self._count]
-        free = yield from unswayed(base, estimate, noise, group.members)
+        free = yield from unsway(base, estimate, noise, group.members)
         since_s, between_s = parting_time(
             base,
             free,
@@ -458,7 +458,7 @@ def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: Give
     count = len(candidates)
     if count < 2:
         return None
-    quadratic, linear = exhausted(item_columns(evidence, comparison, given.mean, 1, candidates))
+    quadratic, linear = exhaust(item_columns(evidence, comparison, given.mean, 1, candidates))
     precision = quadratic.reshape(count, 4, count, 4)[:, :2, :, :2]
     pull = linear.reshape(count, 4)[:, :2]
     place = given.mean[candidates]

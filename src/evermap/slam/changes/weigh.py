@@ -82,7 +82,7 @@ def weigh(
         same = from_nothing.get((factor, softness))
         if start is None and same is not None and same[0] is evidence:  # no copy was left out since
             return same[1:]
-        soft = evidence.softened(softness)
+        soft = evidence.soften(softness)
         yield dense_ms(len(soft.pull))
         comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
         yield dense_ms(len(soft.pull))
@@ -251,7 +251,7 @@ def without_transients(
         spared = evidence.window >= seen.last[evidence.landmark]  # not seen again
         is_first = ~given.given[evidence.landmark] & (evidence.window <= seen.first[evidence.landmark])
         alone = np.where(spared, 0.0, _gains(comparison, spread, prior, near=is_first))
-        after = _explained_away(evidence, comparison, found, position, prior)
+        after = _integrate_moves(evidence, comparison, found, position, prior)
         yield dense_ms(len(comparison.pull))
         still = np.where(spared, 0.0, _gains(after, spread, prior, near=is_first))
         candidates: list[tuple[int, float]] = []  # a copy, and what leaving it out gains over keeping it
@@ -290,7 +290,7 @@ def _gains_within(comparison: Comparison, spread: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (pull * solved).sum(axis=1) - 0.5 * np.linalg.slogdet(np.outer(spread, spread) * inner)[1])
 
 
-def _explained_away(
+def _integrate_moves(
     evidence: WindowEvidence, comparison: Comparison, found: Hypotheses, position: FloatArray, prior: ChangesConfig
 ) -> Comparison:
     """The comparison with the motions of the best hypothesis integrated out."""

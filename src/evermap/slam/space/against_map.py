@@ -18,7 +18,7 @@ from evermap.geometry import se2, se3
 from evermap.slam.changes.evidence import WindowEvidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import PLACES, POINTS
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
 from evermap.slam.space.range_errors import consider_range_errors, find_range_errors, shows_errors
 from evermap.types import FloatArray, IntArray
@@ -124,7 +124,7 @@ def compared(
         back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
         problem = replace(problem, prior=replace(problem.prior, sigma=sigma, weight=weight))
-        optimum = converged(problem, optimum.estimate, begun, heavy_rounds=int(back))
+        optimum = converge(problem, optimum.estimate, begun, heavy_rounds=int(back))
         error = find_range_errors(optimum)
         held |= bool(np.any(np.abs(error - problem.range_error) > SETTLED_ERROR))
         problem = problem.with_range_error(error)

@@ -17,7 +17,7 @@ from evermap.config import BodiesConfig, StillConfig
 from evermap.estimate.sparse.elimination import Spread
 from evermap.geometry import se3
 from evermap.slam.intake import find_bodies
-from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, first_places
+from evermap.slam.space.estimate import SpatialOptimum, as_seen, converge, first_places
 from evermap.slam.space.intake import Rests, SpatialIntake, start_noise
 from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialProblem
 from evermap.tracking.standing import log_factor_of_rest
@@ -133,7 +133,7 @@ def _poses(intake: SpatialIntake, body: IntArray, rest: IntArray) -> tuple[Spati
     estimate = first_places(split, intake.driven_pose)
     if known.any():
         some = split.seeing(known).as_points()
-        optimum = converged(some, first_places(some, intake.driven_pose), noise)
+        optimum = converge(some, first_places(some, intake.driven_pose), noise)
         estimate, noise = optimum.estimate, optimum.noise
     seen_s = problem.stamp_s[np.unique(problem.pose_row[known])]
     at_s = problem.seen_s
@@ -316,7 +316,7 @@ def join_rests(optimum: SpatialOptimum, rests: Rests) -> tuple[SpatialOptimum, I
         prior=replace(problem.prior, place=first.astype(np.int64)),
     )
     start = replace(estimate, place=estimate.place[kept])
-    return converged(joined, start, optimum.noise, heavy_rounds=1), rests.landmark[kept], tuple(moves)
+    return converge(joined, start, optimum.noise, heavy_rounds=1), rests.landmark[kept], tuple(moves)
 
 
 def _in_turn(mine: IntArray, rests: Rests) -> list[IntArray]:

@@ -21,10 +21,10 @@ import numpy as np
 
 from evermap.config import CalibrationConfig
 from evermap.errors import NumericalError
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se3
-from evermap.slam.calibration import priced
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.calibration import price
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.linearise import MOUNT, STATES
 from evermap.slam.space.problem import SpatialEstimate, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
@@ -61,36 +61,36 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
         return optimum, None
     least_s = OF_STEP * problem.path.step_s if problem.has_clock_of_frames else 0.0
     count, start, stated = len(problem.mount), optimum.estimate, optimum
-    free = _freed(problem, optimum, np.full(count, sigma_s), np.zeros(count))
+    free = _free_delays(problem, optimum, np.full(count, sigma_s), np.zeros(count))
     smoother = SpatialSmoother(free, start.pose)
     now = smoother.linearised(start, optimum.noise, heavy=False)
     factorised = smoother.factorised(now)
-    now, delay = smoother.after(now, exhausted(factorised.solution())), np.arange(MOUNT, STATES * count, STATES)
+    now, delay = smoother.after(now, exhaust(factorised.solution())), np.arange(MOUNT, STATES * count, STATES)
     jitter = _jitter(smoother, now, np.diag(factorised.border_covariance())[delay], sigma_s)
     information, jitters = factorised.information.copy(), np.zeros(len(factorised.right))
     jitters[delay] = jitter
     off_s = np.asarray(np.linalg.solve(information - np.diag(jitters), factorised.right)[delay])
     if _is_of_step(off_s, least_s):
         return optimum, None
-    found, _ = _priced(smoother, now, off_s, sigma_s, jitter)
+    found, _ = _price_delays(smoother, now, off_s, sigma_s, jitter)
     # of a clock that is left as stated it is told how late it is if it is not
     found = replace(found, sigma_s=found.sigma_s / np.sqrt(np.maximum(found.p_needed, 1e-12)))
     narrow = np.zeros(count)
     least = USUAL.p_needed  # clocks that may as well be right are left as stated
     for _ in range(MOST_ROUNDS):
         asked = found.p_needed > least
-        free = _freed(problem, optimum, np.where(asked, sigma_s, 0.0), optimum.estimate.delay_s)
+        free = _free_delays(problem, optimum, np.where(asked, sigma_s, 0.0), optimum.estimate.delay_s)
         free = replace(free, delay_jitter=np.where(asked, jitter, 0.0))
         if not asked.any():
             if not optimum.estimate.delay_s.any():
                 return optimum, found
-            return converged(problem, _moved(optimum, problem, asked), optimum.noise), found
+            return converge(problem, _moved(optimum, problem, asked), optimum.noise), found
         try:
-            optimum = converged(free, _moved(optimum, free, asked), optimum.noise)
+            optimum = converge(free, _moved(optimum, free, asked), optimum.noise)
         except NumericalError:  # what seemed to show a delay was jitter of the velocity
             return stated, found
         smoother, now = optimum.smoother, optimum.now
-        again, narrow = _priced(smoother, now, optimum.estimate.delay_s, sigma_s, np.zeros(count))
+        again, narrow = _price_delays(smoother, now, optimum.estimate.delay_s, sigma_s, np.zeros(count))
         found = Delays(np.where(asked, again.sigma_s, found.sigma_s), np.where(asked, again.p_needed, found.p_needed))
         least = USUAL.p_spare
         if np.abs(optimum.estimate.delay_s - free.whole_s).max() < SETTLED * find_step_s(problem):
@@ -101,7 +101,7 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
     if _is_of_step(optimum.estimate.delay_s, least_s):
         return stated, None
     sober = replace(free, delay_sigma_s=np.where(asked, narrow**-0.5, 0.0))
-    return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
+    return converge(sober, optimum.estimate, optimum.noise, heavy_rounds=0), found
 
 
 def _is_of_step(delay_s: FloatArray, least_s: float) -> bool:
@@ -120,12 +120,12 @@ def find_step_s(problem: SpatialProblem) -> float:
     return min(problem.path.step_s, float(np.median(np.diff(problem.stamp_s))))
 
 
-def _freed(
+def _free_delays(
     problem: SpatialProblem, optimum: SpatialOptimum, sigma_s: FloatArray, delay_s: FloatArray
 ) -> SpatialProblem:
     """Return the problem with delays of standard deviations (S,), near those (S,)."""
     assert problem.path is not None
-    velocity_s = _averaged_over(problem, optimum.smoother.driven(optimum.now))
+    velocity_s = _find_averaging_time(problem, optimum.smoother.driven(optimum.now))
     step_s = find_step_s(problem)
     whole_s = step_s * np.round(delay_s / step_s)
     return replace(problem, velocity_s=velocity_s, whole_s=whole_s, delay_sigma_s=sigma_s)
@@ -147,7 +147,7 @@ def _jitter(smoother: SpatialSmoother, now: SpatialLinear, variance: FloatArray,
     return np.maximum(1.0 / variance - sigma_s**-2, 0.0) * (1.0 - min(real / changes, 1.0))
 
 
-def _priced(
+def _price_delays(
     smoother: SpatialSmoother, now: SpatialLinear, delay_s: FloatArray, sigma_s: float, jitter: FloatArray
 ) -> tuple[Delays, FloatArray]:
     """Return what delays (S,) under the prior say, and (S,) the information of the narrower one with their means.
@@ -161,13 +161,13 @@ def _priced(
         variance = 1.0 / (1.0 / variance - jitter[row])
         real, changes = _shown(problem, smoother.driven(now), float(delay_s[row]))
         worth *= max(changes / real, 1.0)
-        p_needed[row], information[row] = priced(float(delay_s[row]), variance, worth, sigma_s)
+        p_needed[row], information[row] = price(float(delay_s[row]), variance, worth, sigma_s)
         own = worth * variance * sigma_s**2 / (worth * variance + sigma_s**2)
         sigma[row] = np.sqrt(p_needed[row] * (own + (1.0 - p_needed[row]) * delay_s[row] ** 2))
     return Delays(sigma, p_needed), information
 
 
-def _averaged_over(problem: SpatialProblem, driven: FloatArray) -> float:
+def _find_averaging_time(problem: SpatialProblem, driven: FloatArray) -> float:
     """Return the time over which averaged velocities show most of a delay."""
     assert problem.path is not None
     step_s = problem.path.step_s

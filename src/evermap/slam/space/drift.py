@@ -86,7 +86,7 @@ def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
             curves.append(Curve(lag_s, square, _worth(stamp_s[mine], lag_s)))
     if not curves:
         return Drift(None, None, 1.0, np.ones(len(problem.place)))
-    shared = _shared_growth(problem, at, stamp_s)
+    shared = _find_shared_growth(problem, at, stamp_s)
     growth = min(_least_growth(curve) for curve in curves)
     if shared is not None:  # at most a standard deviation above what pairs share
         growth = float(np.clip(growth, max(shared.mean - shared.sigma, 0.0), max(shared.mean, 0.0) + shared.sigma))
@@ -134,7 +134,7 @@ class _Growth(NamedTuple):
         return max(self.mean + self.sigma * beyond, 0.0)
 
 
-def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray) -> _Growth | None:
+def _find_shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray) -> _Growth | None:
     """Return how the variance of what moves two landmarks alike grows; None where no two are seen together."""
     often = np.argsort(-np.bincount(problem.place, minlength=len(problem.oriented)), kind="stable")[:SEEN_TOGETHER]
     rows = [np.flatnonzero(problem.place == place) for place in often]
@@ -310,10 +310,10 @@ def _still(
     """
     weight, count = sigma**-2.0, int(of.max()) + 1
     moving_mps, usual = given.moving_mps, np.array([given.sigma_scale, given.sigma_bend])
-    t = _centred(when_s[:, None], of, count, weight)[:, 0]
+    t = _centre_objects(when_s[:, None], of, count, weight)[:, 0]
     curve = np.maximum(np.bincount(of, weight * t**2, minlength=count), 1e-9)
-    velocity = _summed((weight * t)[:, None] * at, of, count) / curve[:, None]
-    slope = (_summed((weight * t)[:, None] * by.reshape(-1, 4), of, count) / curve[:, None]).reshape(-1, 2, 2)
+    velocity = _sum_objects((weight * t)[:, None] * at, of, count) / curve[:, None]
+    slope = (_sum_objects((weight * t)[:, None] * by.reshape(-1, 4), of, count) / curve[:, None]).reshape(-1, 2, 2)
     alike = np.maximum(1.0, alike_s * np.bincount(of) / np.maximum(_spans(when_s, of, count), 1e-3))
     variance = given.still_mps**2 + alike / curve
     best, found = -np.inf, np.ones(count)
@@ -344,7 +344,7 @@ def _spans(when_s: FloatArray, of: IntArray, count: int) -> FloatArray:
 
 def _stretches(when_s: FloatArray, of: IntArray, count: int) -> IntArray:
     """Return the (count,) stretch of the drive of each object, with equal numbers in each."""
-    middle = _summed(when_s[:, None], of, count)[:, 0] / np.bincount(of)
+    middle = _sum_objects(when_s[:, None], of, count)[:, 0] / np.bincount(of)
     return np.asarray(np.argsort(np.argsort(middle)) * STRETCHES // count)
 
 
@@ -356,17 +356,17 @@ def _steady(
     trust, found, count = np.maximum(still, 1e-9)[of], np.zeros(2), len(still)
     weight, total, told = trust / sigma**2, np.eye(2), np.zeros((count, 2))
     for _ in range(ROUNDS):
-        off, slope = _centred(at, of, count, weight), _centred(by.reshape(len(at), 4), of, count, weight)
+        off, slope = _centre_objects(at, of, count, weight), _centre_objects(by.reshape(len(at), 4), of, count, weight)
         slope = slope.reshape(-1, 2, 2)
         square = np.einsum("k,kia,kib->kab", weight, slope, slope)
         right = -np.einsum("k,kia,ki->ka", weight, slope, off)
         total = square.sum(axis=0) + np.diag(prior**-2.0)
         found = np.linalg.solve(total, right.sum(axis=0))
-        told = _summed(right - square @ found, of, count)
+        told = _sum_objects(right - square @ found, of, count)
         residual = np.linalg.norm(off + slope @ found, axis=1) / (HEAVY * sigma)
         weight = trust / (sigma * np.hypot(1.0, residual)) ** 2
     inverse, deviation = np.linalg.inv(total), []
-    for part, witnesses in ((told, float(still.sum())), (_summed(told, stretch, STRETCHES), float(STRETCHES))):
+    for part, witnesses in ((told, float(still.sum())), (_sum_objects(told, stretch, STRETCHES), float(STRETCHES))):
         spread = inverse @ part.T @ part @ inverse * witnesses / max(witnesses - 2.0, 1e-3)
         deviation.append(np.sqrt(np.maximum(np.diag(spread), 0.0)))
     return found, np.array(deviation)
@@ -379,12 +379,12 @@ def _log_odds(value: float, sigma: float, usual: float, count: float) -> float:
     return float(fit - np.log(np.hypot(usual, sigma) / sigma))
 
 
-def _centred(values: FloatArray, of: IntArray, count: int, weight: FloatArray) -> FloatArray:
+def _centre_objects(values: FloatArray, of: IntArray, count: int, weight: FloatArray) -> FloatArray:
     """Return values (K, C) less the mean of their object."""
-    mean = _summed(weight[:, None] * values, of, count) / np.bincount(of, weight, minlength=count)[:, None]
+    mean = _sum_objects(weight[:, None] * values, of, count) / np.bincount(of, weight, minlength=count)[:, None]
     return np.asarray(values - mean[of])
 
 
-def _summed(values: FloatArray, of: IntArray, count: int) -> FloatArray:
+def _sum_objects(values: FloatArray, of: IntArray, count: int) -> FloatArray:
     """Return (count, C) sums by object."""
     return np.stack([np.bincount(of, column, minlength=count) for column in values.T], axis=1)

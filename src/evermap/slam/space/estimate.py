@@ -68,7 +68,7 @@ class SpatialOptimum:
         return self.fitted or (self.smoother, self.now)
 
 
-def converged(
+def converge(
     problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise, *, heavy_rounds: int = 2
 ) -> SpatialOptimum:
     """Return the optimum and its noise levels, alternated until neither changes.
@@ -101,7 +101,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
 
     What the fit absorbed is taken as it was under the levels before (expectation-maximisation: Dempster, Laird and
     Rubin 1977). Steps end at the same levels as whole ones, which where residuals are correlated in time are too sure
-    of the odometry; but they are shorter, and `converged` stops before.
+    of the odometry; but they are shorter, and `converge` stops before.
     """
     problem, kind = smoother.problem, smoother.problem.kind
     if not problem.estimate_noise:

@@ -15,12 +15,12 @@ from evermap.config import ChangesConfig
 from evermap.geometry import se3
 from evermap.slam.correlation import Lasting
 from evermap.slam.space.against_map import MapComparison, MovedTogether, compared, log_map_density
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_groups import find_moved_groups
 from evermap.slam.space.moved_within import ROUNDS, MovedWithin, find_two_places, list_movers
 from evermap.slam.space.problem import SpatialNoise
-from evermap.slam.space.repair import rejoined, repaired, split, unjumped
+from evermap.slam.space.repair import rejoined, repaired, split, undo_jumps
 from evermap.types import BoolArray, FloatArray, IntArray
 
 SPLITS = 2
@@ -126,17 +126,17 @@ def _explain_with(
     """
     problem = optimum.smoother.problem
     if problem.driven and len(problem.prior.place):
-        optimum = unjumped(optimum)
+        optimum = undo_jumps(optimum)
     for _ in range(SPLITS):
         parts = split(optimum, identity, whole)
         if parts is None:
             break
         problem, estimate, identity = parts
-        optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
+        optimum = repaired(converge(problem, estimate, optimum.noise, heavy_rounds=0))
     apart = np.isin(np.arange(len(identity)), [row for move in moves for row in (move.before, move.after)])
     apart[:given] = True
     if (together := rejoined(optimum, identity, apart)) is not None:
-        optimum = converged(*together, optimum.noise, heavy_rounds=0)
+        optimum = converge(*together, optimum.noise, heavy_rounds=0)
     if not len(stated):
         return SpatialExplanation(optimum, identity, moves, None)
     groups: tuple[MovedTogether, ...] = ()

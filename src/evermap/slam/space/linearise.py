@@ -257,9 +257,9 @@ def _position_or_pose(
         point_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
     if seen.ray[m]:
         _by_range(seen.measured[m], e, jx, jl, jm)
-    _whitened(seen.root[m], level, e.reshape(8, 1))
+    _whiten_rows(seen.root[m], level, e.reshape(8, 1))
     for part in (jx, jl, jm):
-        _whitened(seen.root[m], level, part)
+        _whiten_rows(seen.root[m], level, part)
     if seen.kind[m] == POSE:
         factor = 1.0 / (level[ORIENTATION] * seen.sigma_rad[m])
         for a in range(3, 6):
@@ -290,7 +290,7 @@ def _by_range(measured: FloatArray, e: FloatArray, jx: FloatArray, jl: FloatArra
 
 
 @kernel
-def _whitened(root: FloatArray, level: FloatArray, rows: FloatArray) -> None:
+def _whiten_rows(root: FloatArray, level: FloatArray, rows: FloatArray) -> None:
     """Whiten the first three of some rows, in place."""
     for b in range(rows.shape[1]):
         x, y, z = rows[0, b], rows[1, b], rows[2, b]

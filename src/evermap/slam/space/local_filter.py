@@ -179,7 +179,7 @@ class SpatialFilter(LocalFilter):
         at, rows = self.columns(slots).reshape(-1, OF_PLACE), self._row[slots]
         turn, turned = se3.rotation_of(self.pose), np.isfinite(self.position[rows, 3])
         before = self.position[rows]
-        after = _carried(before, step[at], turn @ step[3:6], turned)
+        after = _carry_by_steps(before, step[at], turn @ step[3:6], turned)
         covariance, heading = self.covariance, self.covariance[3:6].copy()
         by_turn = -_crossing(after[~turned, :3] - before[~turned, :3]) @ turn
         points, twists = at[~turned, :3], at[turned]
@@ -212,7 +212,7 @@ class _SpatialFrame:
     def __init__(self, of: SpatialFilter, rows: IntArray, seen: SpatialFrame) -> None:
         count, self._of = len(rows), of
         self._pose, self._states, self._place = of.pose, of.states, of.position[rows]
-        self._turned = turned = np.isfinite(self._place[:, 3])
+        self._turn_axes = turned = np.isfinite(self._place[:, 3])
         self._place_or_still = np.where(turned[:, None] | (np.arange(7) < 3), self._place, STILL)
         kind, dim = np.where(turned, seen.kind, POINT), np.where(turned, 6, 3)
         self.n_rows = ROWS[kind]
@@ -238,17 +238,17 @@ class _SpatialFrame:
         by_place, turn = step[own:].reshape(-1, OF_PLACE), se3.rotation_of(start)
         place = self._place_or_still
         if by_place.any():
-            place = _carried(place, by_place, turn @ step[3:6], self._turned)
+            place = _carry_by_steps(place, by_place, turn @ step[3:6], self._turn_axes)
         linearise_sightings(
             se3.retract(start, step[:6])[None], place, of._mount_at(self._states + step[6:own]), of._back, of._back,
             of.levels, self._seen, False, self._values, self._weight, self._residual,
         )  # fmt: skip
         self.residual[:] = self._residual[:, : self.residual.shape[1]]
-        _unpack(self._values, self._seen.first, self.n_rows, self._turned, self.jacobian)
+        _unpack(self._values, self._seen.first, self.n_rows, self._turn_axes, self.jacobian)
         if not step[:6].any():
             return
         # from errors at the step to those before it
-        jacobian, turned = self.jacobian, self._turned
+        jacobian, turned = self.jacobian, self._turn_axes
         jacobian[..., :6] = jacobian[..., :6] @ se3.adjoint(se3.exp(-step[:6]))
         if place is self._place_or_still:
             return
@@ -272,7 +272,7 @@ def _unpack(values: FloatArray, first: IntArray, n_rows: IntArray, turned: BoolA
             at += OF_SIGHTING + dim
 
 
-def _carried(place: FloatArray, step: FloatArray, turn: FloatArray, turned: BoolArray) -> FloatArray:
+def _carry_by_steps(place: FloatArray, step: FloatArray, turn: FloatArray, turned: BoolArray) -> FloatArray:
     """Return places (M, 7) after steps (M, 6), where the heading turns by a rotation vector of the world."""
     after = place.copy()
     after[turned] = se3.retract(place[turned], step[turned])

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.align.candidates import AGREE_M, Matches, rank_motions
 from evermap.slam.space.against_map import log_density_in_map
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.problem import LEAST_WEIGHT, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -46,7 +46,7 @@ def start_by_consensus(
                 continue
             tried.append(agree)
             held = replace(problem, prior=replace(problem.prior, weight=np.where(agree, 1.0, LEAST_WEIGHT)))
-            found = converged(held, start, alone.noise, heavy_rounds=1)
+            found = converge(held, start, alone.noise, heavy_rounds=1)
             cost = cost_in_map(found, stated, alone.noise)
             if best is None or cost < best[1]:
                 best = found, cost

@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.correlation import Lasting
 from evermap.slam.room import hold_in_room
 from evermap.slam.space.estimate import SpatialOptimum
@@ -88,7 +88,7 @@ def log_marginal_likelihood(
     if of_places:
         free = np.setdiff1d(np.arange(len(problem.oriented)), problem.prior.place)
         graph, _, of_room = hold_in_room(graph, len(problem.stamp_s) + free)
-    information = exhausted(graph.factorised(linear.now))
+    information = exhaust(graph.factorised(linear.now))
     return float(of_room - of_inliers - of_outliers - of_odometry - priors - 0.5 * information.log_determinant)
 
 
@@ -119,7 +119,7 @@ def _likeliest_lasting(
         shapes += [Lasting(np.array([persist_s]), np.array([share])) for share in SHARES]
     best, found = -np.inf, (lasting, np.ones(len(good)), noise, 0.0)
     for shape in shapes:
-        white, new = _whitened(problem, residual, good, shape)
+        white, new = _condition_errors(problem, residual, good, shape)
         scale = _scales(problem, white, good)
         at = SpatialNoise(*(noise.levels * scale).tolist())
         likelihood = 0.5 * float((ROWS[problem.kind] * np.log(new))[good].sum())
@@ -154,7 +154,7 @@ def _scales(problem: SpatialProblem, white: FloatArray, good: BoolArray) -> Floa
     return np.sqrt(np.where((counts > 0) & (squares > 0.0), squares / np.maximum(counts, 1), 1.0))
 
 
-def _whitened(
+def _condition_errors(
     problem: SpatialProblem, residual: FloatArray, good: BoolArray, lasting: Lasting
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals (M, 8) less what those of the same landmark before say of them, and (M,) informations of what

@@ -13,10 +13,10 @@ import numpy as np
 
 from evermap.align.candidates import AGREE_M, Matches, find_consensus
 from evermap.config import ChangesConfig
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.changes.weigh import MAP_FACTORS, ChangePosterior, weigh
 from evermap.slam.space.against_map import AgainstMap, MovedTogether, evidence_against
-from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -51,12 +51,10 @@ def find_moved_groups(
     if not problem.driven or len(prior.place) > MOST_PLACES:
         return optimum, ()
     found: list[tuple[ChangePosterior, SpatialOptimum, AgainstMap]] = []
-    for free in _loosened(optimum, stated, changes):
+    for free in _loosen(optimum, stated, changes):
         against = evidence_against(free, stated)
         if len(against.row):
-            found.append(
-                (exhausted(weigh(against.evidence, against.given, changes, 1, factors=FACTORS)), free, against)
-            )
+            found.append((exhaust(weigh(against.evidence, against.given, changes, 1, factors=FACTORS)), free, against))
     if not found:
         return optimum, ()
     posterior, free, against = max(found, key=lambda one: one[0].score)
@@ -70,10 +68,10 @@ def find_moved_groups(
         return optimum, ()
     moved = np.isin(np.arange(len(prior.place)), np.concatenate([group.members for group in groups]))
     held = replace(prior, weight=np.where(moved, LEAST_WEIGHT, 1.0))
-    return converged(replace(problem, prior=held), free.estimate, free.noise, heavy_rounds=1), groups
+    return converge(replace(problem, prior=held), free.estimate, free.noise, heavy_rounds=1), groups
 
 
-def _loosened(optimum: SpatialOptimum, stated: FloatArray, changes: ChangesConfig) -> list[SpatialOptimum]:
+def _loosen(optimum: SpatialOptimum, stated: FloatArray, changes: ChangesConfig) -> list[SpatialOptimum]:
     """Return optima by a map that bends nothing, at where most of its places are, with errors that last counted.
 
     At first every place counts, and those that moved draw the whole along; then those that agree with each other. How
@@ -85,7 +83,7 @@ def _loosened(optimum: SpatialOptimum, stated: FloatArray, changes: ChangesConfi
     sigma = np.maximum(stated, np.repeat([changes.loose_map_m, LOOSE_RAD], 3))
     sigma[:, 3:][unknown] = UNKNOWN_RAD
     loose = replace(problem, prior=replace(prior, sigma=sigma, weight=np.ones(len(prior.place))))
-    free = converged(loose, optimum.estimate, optimum.noise, heavy_rounds=1)
+    free = converge(loose, optimum.estimate, optimum.noise, heavy_rounds=1)
     hits = np.bincount(problem.place, free.now.weight, minlength=len(problem.oriented))[prior.place]
     seen = np.flatnonzero(hits > problem.settings.map.least_seen)
     at, known = free.estimate.place[prior.place[seen]], prior.pose[seen].copy()
@@ -101,11 +99,11 @@ def _loosened(optimum: SpatialOptimum, stated: FloatArray, changes: ChangesConfi
         weight = np.full(len(prior.place), LEAST_WEIGHT)
         weight[seen[agree]] = 1.0
         there = replace(loose, prior=replace(loose.prior, weight=weight))
-        found.append(_counted(SpatialOptimum(start, free.noise, SpatialSmoother(there, start.pose), free.now)))
-    return found or [_counted(free)]
+        found.append(_count_again(SpatialOptimum(start, free.noise, SpatialSmoother(there, start.pose), free.now)))
+    return found or [_count_again(free)]
 
 
-def _counted(optimum: SpatialOptimum) -> SpatialOptimum:
+def _count_again(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum next to this, with errors of detections that last counted as what they are worth."""
     smoother = optimum.smoother.counted(optimum.estimate, optimum.now)
     estimate, now = smoother.optimum(optimum.estimate, optimum.noise, heavy=False)

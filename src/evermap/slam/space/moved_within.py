@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from evermap.geometry import se3
 from evermap.slam.changes.explain import find_instant
-from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, oriented
+from evermap.slam.space.estimate import SpatialOptimum, as_seen, converge, oriented
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import losses_at, repaired
 from evermap.slam.space.smoother import SpatialSmoother
@@ -88,7 +88,7 @@ class TwoPlaces(NamedTuple):
     nats: float
 
 
-def superseded(moves: tuple[MovedWithin, ...], count: int) -> BoolArray:
+def find_superseded(moves: tuple[MovedWithin, ...], count: int) -> BoolArray:
     """Return which of `count` places landmarks have left."""
     left = np.zeros(count, dtype=np.bool_)
     left[[move.before for move in moves]] = True
@@ -197,7 +197,7 @@ def _find_among(
     if not found:
         return None, single
     best = min(found, key=lambda two: two.optimum.now.cost)
-    better = repaired(converged(best.optimum.smoother.problem, best.optimum.estimate, optimum.noise, heavy_rounds=0))
+    better = repaired(converge(best.optimum.smoother.problem, best.optimum.estimate, optimum.noise, heavy_rounds=0))
     nats = _nats_of_looks(better, best.before, best.after, best.since_s)
     return best._replace(optimum=better, nats=nats), single
 

@@ -25,10 +25,10 @@ from evermap.slam.intake import most_of, usable_detections
 from evermap.slam.space.bodies import FEWEST, with_rests
 from evermap.slam.space.bridge import bridge
 from evermap.slam.space.drift import Gauge, gauge_of
-from evermap.slam.space.estimate import converged, first_places
+from evermap.slam.space.estimate import converge, first_places
 from evermap.slam.space.intake import SpatialIntake, prepare_space, scale_between
 from evermap.slam.space.problem import SpatialProblem
-from evermap.slam.space.result import concluded_in_space, distinguished
+from evermap.slam.space.result import conclude_in_space, distinguish
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.solve import SpatialSolved, solve_space, times_of
 from evermap.tracking.frame import Poses, box_table, boxes_of, in_world, mounts_of, with_empty_frames
@@ -138,8 +138,8 @@ def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: Trac
     sigma = max(scale_between(recording.sensors, space, space.traffic.sigma_scale)[0], 1e-6)
     space = space.model_copy(update={"traffic": space.traffic.model_copy(update={"sigma_scale": sigma})})
     if is_located(recording, space.traffic):
-        return _taken_beside_landmarks(recording, rows, driven, space, track)
-    return _taken(recording, rows, driven, *_settled(recording, driven, space, track), space)
+        return _take_beside_landmarks(recording, rows, driven, space, track)
+    return _take_recording(recording, rows, driven, *_settle(recording, driven, space, track), space)
 
 
 def is_located(recording: SpatialRecording, settings: TrafficConfig) -> bool:
@@ -155,7 +155,7 @@ def is_located(recording: SpatialRecording, settings: TrafficConfig) -> bool:
     return bool(np.mean(near) > MOSTLY)
 
 
-def _taken_beside_landmarks(
+def _take_beside_landmarks(
     recording: SpatialRecording, rows: IntArray, driven: FloatArray, space: SpaceConfig, track: TrackConfig
 ) -> TrafficIntake:
     """The recording as the solver takes it where landmarks locate the robot, with their solution."""
@@ -168,7 +168,7 @@ def _taken_beside_landmarks(
     optimum = solved.optimum
     path = bridge(named.frames, optimum.smoother.problem, optimum.estimate, optimum.noise)
     path = se3.interpolate(recording.frames.stamp_s[named.frames.row], path, recording.frames.stamp_s)
-    stays, gauge = _settled(recording, path, space, track, bends=False)
+    stays, gauge = _settle(recording, path, space, track, bends=False)
     known, range_m = _first_free(recording), np.linalg.norm(given.position_sensor_m[boxes], axis=1)
     identity, variance = np.full(len(given), UNKNOWN), given.covariance_sensor_m2.copy()
     identity[boxes] = np.where(stays.stay == UNKNOWN, UNKNOWN, known + stays.stay)
@@ -250,7 +250,7 @@ def _with_boxes(solved: SpatialSolved, boxes: SpatialProblem, first_box: int) ->
     return replace(solved, optimum=found, identity=identity, number=np.append(solved.number, np.ones(count, dtype=int)))
 
 
-def _taken(
+def _take_recording(
     recording: SpatialRecording, rows: IntArray, driven: FloatArray, stays: Stood, gauge: Gauge, space: SpaceConfig
 ) -> TrafficIntake:
     """The recording as the solver takes it, with the errors taken off that repeat themselves."""
@@ -264,12 +264,12 @@ def _taken(
     return TrafficIntake(recording, rows, driven, stays, gauge, known, used, standing_only, intake)
 
 
-def rescaled(taken: TrafficIntake, factor: float) -> TrafficIntake:
+def rescale(taken: TrafficIntake, factor: float) -> TrafficIntake:
     """Return the same with all lengths scaled to a map: odometry and ranges alike."""
     ranges, driven = factor * taken.gauge.range_scale, factor * taken.gauge.odometry_scale
     gauge = taken.gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
     space = taken.intake.problem.settings
-    return _taken(taken.recording, taken.rows, taken.driven, taken.stays, gauge, space)
+    return _take_recording(taken.recording, taken.rows, taken.driven, taken.stays, gauge, space)
 
 
 def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> SpatialSolved:
@@ -290,7 +290,7 @@ def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> 
     if len(np.unique(problem.place)) < problem.settings.traffic.witnesses:
         return solved
     noise = replace(optimum.noise, translation=WANDERS[0], rotation=WANDERS[1])
-    other = converged(replace(problem, steady=False), optimum.estimate, noise, heavy_rounds=0)
+    other = converge(replace(problem, steady=False), optimum.estimate, noise, heavy_rounds=0)
     better = optimum.noise.position > problem.settings.traffic.better_by * other.noise.position
     return replace(solved, optimum=other) if better else solved
 
@@ -299,7 +299,7 @@ def conclude_in_traffic(
     taken: TrafficIntake, intake: SpatialIntake, solved: SpatialSolved, track: TrackConfig
 ) -> tuple[SlamResult, TrackResult | None]:
     """Return poses and static objects, with rows of detections of `taken.recording`; and tracks along these poses."""
-    result = concluded_in_space(taken.standing, intake, solved)
+    result = conclude_in_space(taken.standing, intake, solved)
     followed = follow_boxes(taken.recording, result.trajectory.pose_world_robot, taken.gauge, track)
     alone = se3.compose(result.trajectory.pose_world_robot[0], taken.driven)
     return replace(
@@ -326,7 +326,7 @@ def _whole(recording: SpatialRecording) -> tuple[SpatialRecording, IntArray]:
     return whole, np.flatnonzero(kept)
 
 
-def _settled(
+def _settle(
     recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig, *, bends: bool = True
 ) -> tuple[Stood, Gauge]:
     """Return static objects and systematic errors, alternated until the errors no longer change; `bends` is whether the
@@ -412,7 +412,7 @@ def with_stays(
     if followed is not None:  # the track that most boxes of each stay are of
         most = most_of(stays.stay, followed.track_of_detection, len(of))
         of = np.where(most == UNKNOWN, of, most)
-    identities, names = distinguished(known + of, times_of(of), {})
+    identities, names = distinguish(known + of, times_of(of), {})
     stay = landmarks.landmark_id - known
     ours = np.flatnonzero((stay >= 0) & (stay < len(identities)))
     stay, new = stay[ours], landmarks.landmark_id.copy()
@@ -421,7 +421,7 @@ def with_stays(
     p_exists[ours] = stays.p_stay[stay]
     told = replace(landmarks, landmark_id=new, p_exists=p_exists, names={**landmarks.names, **names})
     if followed is not None and len(ours):
-        told = _headed(told, ours, of[stay], followed, tilt_rad)
+        told = _add_headings(told, ours, of[stay], followed, tilt_rad)
     renamed = dict(zip(landmarks.landmark_id.tolist(), new.tolist(), strict=True))
     asked = np.array([renamed.get(one, one) for one in result.innovations.landmark_id.tolist()], dtype=np.int64)
     return replace(
@@ -432,7 +432,9 @@ def with_stays(
     )
 
 
-def _headed(landmarks: Landmarks, ours: IntArray, track: IntArray, followed: TrackResult, tilt_rad: float) -> Landmarks:
+def _add_headings(
+    landmarks: Landmarks, ours: IntArray, track: IntArray, followed: TrackResult, tilt_rad: float
+) -> Landmarks:
     """Landmarks with the heading and the belief that their tracks had when they were seen there last."""
     count, tracks = len(landmarks), followed.tracks
     rotation = np.full((count, 4), np.nan) if landmarks.rotation is None else landmarks.rotation.copy()

@@ -71,7 +71,7 @@ class OnlineNoise:
         for level in np.unique(of_row).tolist():
             mine = of_row == level
             score = float((share * pull**2 - np.diag(inverse))[mine].sum())
-            step[level] = self._scaled(level, score, 2.0 * float((inverse[np.ix_(mine, mine)] ** 2).sum()))
+            step[level] = self._scale_levels(level, score, 2.0 * float((inverse[np.ix_(mine, mine)] ** 2).sum()))
         if self._driven:
             by = by_pose.reshape(-1, 6)[at]
             told, known = by.T @ (np.sqrt(share) * pull), by.T @ inverse @ by
@@ -79,9 +79,9 @@ class OnlineNoise:
             told *= np.sqrt(min(1.0, 6.0 * LARGEST_SQUARE / max(motion, 1e-12)))
             for level, since in zip((TRANSLATION, ROTATION), self._since, strict=True):
                 score = float(told @ since @ told - np.trace(known @ since))
-                step[level] = self._scaled(level, score, 2.0 * float(np.trace(known @ since @ known @ since)))
+                step[level] = self._scale_levels(level, score, 2.0 * float(np.trace(known @ since @ known @ since)))
         self.now = SpatialNoise(*np.maximum(self.now.levels * np.exp(step), self._least).tolist())
 
-    def _scaled(self, level: int, score: float, information: float) -> float:
+    def _scale_levels(self, level: int, score: float, information: float) -> float:
         self._information[level] = min(self._information[level], 2.0 * MOST_NUMBERS) + information
         return float(np.clip(score / self._information[level], -LARGEST_STEP, LARGEST_STEP))

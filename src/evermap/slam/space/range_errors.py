@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.slam.space.estimate import SpatialOptimum
 from evermap.slam.space.linearise import ACROSS, ALONG, ROWS
 from evermap.slam.space.problem import SpatialProblem
@@ -39,9 +39,9 @@ def consider_range_errors(optimum: SpatialOptimum) -> FloatArray:
     if problem.driven or len(problem.prior.place) or not problem.has_range.any():
         return np.zeros((smoother.structure.system.tree.begin[-1], 0))
     shape = USUAL * _by_error(replace(optimum, smoother=smoother, now=now))
-    found = exhausted(smoother.factorised(now).solution())
+    found = exhaust(smoother.factorised(now).solution())
     moved = [
-        exhausted(smoother.factorised(smoother.with_residuals(now, own)).solution()) - found
+        exhaust(smoother.factorised(smoother.with_residuals(now, own)).solution()) - found
         for own in (
             np.where((problem.sensor == sensor)[:, None], shape, 0.0)
             for sensor in np.unique(problem.sensor[problem.has_range]).tolist()
@@ -90,4 +90,4 @@ def _by_error(optimum: SpatialOptimum) -> FloatArray:
 
 def _find_residuals(smoother: SpatialSmoother, now: SpatialLinear) -> FloatArray:
     """Return (M, 3) whitened residuals at the optimum of the linearised problem."""
-    return np.asarray(smoother.after(now, exhausted(smoother.factorised(now).solution())).residual[:, :3])
+    return np.asarray(smoother.after(now, exhaust(smoother.factorised(now).solution())).residual[:, :3])

@@ -19,7 +19,7 @@ import numpy as np
 
 from evermap.estimate.noise import GAIN_NATS, fit_variances, gain_by_variances, raise_ranges
 from evermap.geometry import se3
-from evermap.slam.space.estimate import SpatialOptimum, converged, leverages
+from evermap.slam.space.estimate import SpatialOptimum, converge, leverages
 from evermap.slam.space.linearise import ACROSS, ALONG, CORNERS
 from evermap.types import FloatArray
 
@@ -52,7 +52,7 @@ def with_range_noise(optimum: SpatialOptimum) -> SpatialOptimum:
             noise = replace(noise, across=1.0, along=1.0)
         # else what is stated keeps its levels, and noise that is learned is over these
         problem = problem.with_sigma_position(found / noise.levels[[ACROSS, ALONG]])
-        optimum = converged(problem, optimum.estimate, noise, heavy_rounds=0)
+        optimum = converge(problem, optimum.estimate, noise, heavy_rounds=0)
     return optimum
 
 

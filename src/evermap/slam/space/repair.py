@@ -13,10 +13,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
-from evermap.slam.space.estimate import MOST_CANDIDATES, SpatialOptimum, as_seen, converged, oriented
+from evermap.slam.space.estimate import MOST_CANDIDATES, SpatialOptimum, as_seen, converge, oriented
 from evermap.slam.space.linearise import linearise_sightings
 from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.slam.space.starts import located_again
+from evermap.slam.space.starts import locate_again
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_TURNED = 6
@@ -34,7 +34,7 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
     asked: dict[object, SpatialOptimum] = {}  # what each was last asked about: of the same it says the same
     for _ in range(ROUNDS):
         before = optimum
-        for explain in (bridged, other_explanations, _located_again):
+        for explain in (bridge_poses, other_explanations, _locate_again):
             if asked.get(explain) is optimum:
                 continue
             asked[explain] = optimum
@@ -45,7 +45,7 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
                 start, optimum.noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats
             )
             if there.cost < optimum.now.cost - gain_nats:
-                optimum = converged(problem, found, optimum.noise, heavy_rounds=0)
+                optimum = converge(problem, found, optimum.noise, heavy_rounds=0)
         if optimum is before and (optimum := _with_one_turned(optimum)) is before:
             break
     return optimum
@@ -57,7 +57,7 @@ def _with_one_turned(optimum: SpatialOptimum) -> SpatialOptimum:
     Poses from which little else is seen follow a wrong orientation, so that no vote at their optimum tells of it.
     """
     smoother, noise, gain_nats = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
-    starts = [replace(optimum.estimate, place=place) for place in _turned_places(optimum)]
+    starts = [replace(optimum.estimate, place=place) for place in _turn_places(optimum)]
     cost = [smoother.linearised(start, noise, heavy=False).cost for start in starts]
     for k in np.argsort(cost, kind="stable")[:MOST_TURNED].tolist():
         wanted = optimum.now.cost - gain_nats
@@ -65,11 +65,11 @@ def _with_one_turned(optimum: SpatialOptimum) -> SpatialOptimum:
             starts[k], noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats, wanted=wanted
         )
         if there.cost < wanted:
-            return converged(smoother.problem, found, noise, heavy_rounds=0)
+            return converge(smoother.problem, found, noise, heavy_rounds=0)
     return optimum
 
 
-def _turned_places(optimum: SpatialOptimum) -> list[FloatArray]:
+def _turn_places(optimum: SpatialOptimum) -> list[FloatArray]:
     """Return places (P, 7), in each of which one is turned as its views say by the explanation that is not taken."""
     problem, estimate, weight = optimum.smoother.problem, optimum.estimate, optimum.now.weight
     sigma = np.hypot(problem.sigma_rad * optimum.noise.pixel, problem.settings.repair.same_rad)
@@ -89,11 +89,11 @@ def _turned_places(optimum: SpatialOptimum) -> list[FloatArray]:
     return found
 
 
-def _located_again(optimum: SpatialOptimum) -> SpatialEstimate | None:
-    return located_again(optimum.smoother.problem, optimum.noise, optimum.estimate, optimum.now.weight)
+def _locate_again(optimum: SpatialOptimum) -> SpatialEstimate | None:
+    return locate_again(optimum.smoother.problem, optimum.noise, optimum.estimate, optimum.now.weight)
 
 
-def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
+def bridge_poses(optimum: SpatialOptimum) -> SpatialEstimate | None:
     """Return the values with frames between jumps of the odometry where it has them, if that is cheaper; else None."""
     smoother, now, estimate, problem = optimum.smoother, optimum.now, optimum.estimate, optimum.smoother.problem
     bounds, n = np.flatnonzero(now.odometry_weight < 0.5) + 1, len(optimum.estimate.pose)
@@ -108,16 +108,16 @@ def bridged(optimum: SpatialOptimum) -> SpatialEstimate | None:
         for end in ends[k + 1 : k + 1 + problem.settings.repair.jumps].tolist():
             jumps = np.count_nonzero((bounds >= first) & (bounds <= end))
             if lost[end] - lost[first] < jumps * problem.settings.jump_log_odds:
-                trial = _bridged(problem, estimate, first, end)
+                trial = _bridge_poses(problem, estimate, first, end)
                 found.append((smoother.linearised(trial, optimum.noise, heavy=False).cost - now.cost, first, end))
     taken = np.zeros(n, dtype=np.bool_)
     for cost, first, end in sorted(found):
         if cost < 0.0 and not taken[max(first - 1, 0) : end + 1].any():
-            estimate, taken[first:end] = _bridged(problem, estimate, first, end), True
+            estimate, taken[first:end] = _bridge_poses(problem, estimate, first, end), True
     return estimate if taken.any() else None
 
 
-def _bridged(problem: SpatialProblem, estimate: SpatialEstimate, first: int, end: int) -> SpatialEstimate:
+def _bridge_poses(problem: SpatialProblem, estimate: SpatialEstimate, first: int, end: int) -> SpatialEstimate:
     """The values with some poses by the odometry, from the pose before them to the one after them."""
     pose = estimate.pose.copy()
     step = se3.scaled(problem.increment, np.exp(estimate.log_scale))
@@ -134,7 +134,7 @@ def _bridged(problem: SpatialProblem, estimate: SpatialEstimate, first: int, end
     return replace(estimate, pose=pose)
 
 
-def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
+def undo_jumps(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum, or a better one in which landmarks of the map were moved instead of a jump of the robot.
 
     A robot that sees only things that were carried away together finds itself where these had been, and jumps back
@@ -188,7 +188,7 @@ def _as_driven(
         places_go = np.zeros_like(moved)
     held = moved[problem.prior.place]
     prior = replace(problem.prior, weight=np.where(held, LEAST_WEIGHT, problem.prior.weight))
-    found = converged(replace(problem, prior=prior), start, optimum.noise, heavy_rounds=1)
+    found = converge(replace(problem, prior=prior), start, optimum.noise, heavy_rounds=1)
     cost = found.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
     return cost + problem.settings.map.moved_nats * float(held.sum()), found
 

@@ -92,7 +92,7 @@ class _Told:
         return np.asarray(covariance + own @ np.swapaxes(own, 1, 2))
 
 
-def concluded_in_space(
+def conclude_in_space(
     recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved, scratch: str = "first_pose"
 ) -> SlamResult:
     """Return trajectory and map, and differences to a given map; without one, `scratch` is what the frame is."""
@@ -142,7 +142,7 @@ def _trajectory(told: _Told, found: BoolArray) -> Trajectory:
     noise, weight = optimum.sober or optimum.noise, optimum.now.odometry_weight
     covariance = bridge_covariance(frames, problem, optimum.estimate, noise, weight, told.spread)
     covariance = told.add_range_errors(covariance, frames.before)
-    covariance = add_scale_error(covariance, -se3.inverse(pose)[:, :3], _undivided(told))
+    covariance = add_scale_error(covariance, -se3.inverse(pose)[:, :3], _find_undivided(told))
     of = slice(None) if problem.driven else found
     return _path(told, pose, covariance, of)
 
@@ -159,11 +159,11 @@ def numbered(name: str | int, number: int) -> str:
 
 
 def identities_of(intake: SpatialIntake, solved: SpatialSolved) -> tuple[IntArray, dict[int, str]]:
-    """Return `distinguished` ids (P,) of places, and the names of all."""
-    return distinguished(intake.landmark_id[solved.identity], solved.number, intake.names)
+    """Return `distinguish` ids (P,) of places, and the names of all."""
+    return distinguish(intake.landmark_id[solved.identity], solved.number, intake.names)
 
 
-def distinguished(landmark_id: IntArray, number: IntArray, names: Mapping[int, str]) -> tuple[IntArray, dict[int, str]]:
+def distinguish(landmark_id: IntArray, number: IntArray, names: Mapping[int, str]) -> tuple[IntArray, dict[int, str]]:
     """Return ids of which none is there twice, and names with those of the new ones.
 
     Args:
@@ -217,7 +217,7 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     own, axes = told.add_range_errors(told.spread.of(n + turns, 6), n + turns), se3.rotation_of(place[turns])
     covariance[turns] = axes @ own[:, :3, :3] @ np.swapaxes(axes, 1, 2)  # a twist's translation is in the own axes
     turned[turns] = own[:, 3:, 3:]
-    covariance = add_scale_error(covariance, place[:, :3], _undivided(told))
+    covariance = add_scale_error(covariance, place[:, :3], _find_undivided(told))
     order = np.argsort(identities, kind="stable")
     order = order[(hits[order] > 0) & told.placed[order]]
     oriented = bool(problem.oriented.any())
@@ -330,7 +330,7 @@ def mount_parameters(name: str, value: FloatArray, sigma: FloatArray, prior: Flo
     ]
 
 
-def _undivided(told: _Told) -> float:
+def _find_undivided(told: _Told) -> float:
     """Return the standard deviation of all lengths that remains where only ranges and odometer say what a metre is, of
     directions alone the odometer, and without odometry the ranges, of which only a data sheet does.
     """
@@ -350,7 +350,7 @@ def _scales(told: _Told, sigma: float) -> list[ParameterEstimate]:
     problem, share = told.problem, told.problem.ranges_share
     before = told.intake.problem.scale_sigma or told.intake.scale_in_map  # it was averaged since
     odometer, ranges = before * np.sqrt(1.0 - share), before * np.sqrt(share)
-    undivided = _undivided(told)
+    undivided = _find_undivided(told)
     scale = float(np.exp(problem.odometry_log + told.solved.optimum.estimate.log_scale))
     if share == 0.0:
         return [ParameterEstimate("odometry_scale", scale, scale * sigma, 1.0, odometer, "", meaning=SCALE)]

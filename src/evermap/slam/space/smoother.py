@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from evermap.estimate.gauss_newton import Steps, minimised
+from evermap.estimate.gauss_newton import Steps, minimise
 from evermap.estimate.graph import (
     AlikeFactors,
     Border,
@@ -25,7 +25,7 @@ from evermap.estimate.graph import (
 from evermap.estimate.innovations import find_left_out_nis
 from evermap.estimate.measurement import MeasurementFactors
 from evermap.estimate.sparse.elimination import Spread
-from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.estimate.sparse.system import Factorised, exhaust
 from evermap.estimate.start import StartFactor
 from evermap.geometry import se3
 from evermap.slam.correlation import Lasting, Pull
@@ -112,7 +112,7 @@ class SpatialSmoother:
         if structure is None:
             places, border = np.where(problem.oriented, 6, 3), [STATES] * len(problem.mount) + [1]
             layout = Layout.of(around[:, :3], 6, places, border, POSES_A_LEAF)
-            structure = exhausted(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
+            structure = exhaust(build_structure(layout, self._blocks(SpatialNoise(), heavy=False)))
         self.structure = structure
         self._held = self.structure.hold_places(HELD)
         self.hold(self._held, self.structure.system.tree.begin)
@@ -162,21 +162,21 @@ class SpatialSmoother:
             NumericalError: no finite optimum.
         """
         steps = Steps(iterations, tolerance, settled, 0.0, COST_SLACK, FIRST_DAMPING, wanted)
-        solution = exhausted(minimised(self.graph(noise, heavy=heavy), start, steps))
+        solution = exhaust(minimise(self.graph(noise, heavy=heavy), start, steps))
         return solution.state, SpatialLinear(solution.now, self, solution.factorised)
 
     def linearised(self, estimate: SpatialEstimate, noise: SpatialNoise, *, heavy: bool) -> SpatialLinear:
         """Return the problem linearised at `estimate`."""
-        return SpatialLinear(exhausted(self.graph(noise, heavy=heavy).linearised(estimate)), self)
+        return SpatialLinear(exhaust(self.graph(noise, heavy=heavy).linearised(estimate)), self)
 
     def factorised(self, now: SpatialLinear) -> Factorised:
         """Eliminate everything but the sensors' states and the scale of the odometry."""
-        return exhausted(self.graph(SpatialNoise(), heavy=False).factorised(now.now))
+        return exhaust(self.graph(SpatialNoise(), heavy=False).factorised(now.now))
 
     def spread(self, now: SpatialLinear, *, nearly: bool = False) -> Spread:
         """Return covariances of all variables and of what each factor ties; `nearly`: a step before will do."""
         factorised = now.before if nearly and now.before is not None else self.factorised(now)
-        return exhausted(factorised.spread(len(self.problem.increment)))
+        return exhaust(factorised.spread(len(self.problem.increment)))
 
     def find_nis(self, now: SpatialLinear, spread: Spread) -> FloatArray:
         """Return (M,) NIS of all detections, each as if it had not been used."""

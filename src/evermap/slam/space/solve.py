@@ -16,20 +16,20 @@ import numpy as np
 from evermap.align.candidates import Matches, find_consensus
 from evermap.config import ChangesConfig
 from evermap.estimate.measurement import Tied
-from evermap.estimate.sparse.system import exhausted
+from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se3
 from evermap.geometry.group import accumulate
 from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
-from evermap.slam.calibration import priced
+from evermap.slam.calibration import price
 from evermap.slam.space.against_map import MapComparison, has_contradictions
 from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrust_bodies, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
 from evermap.slam.space.estimate import (
     SpatialOptimum,
-    converged,
+    converge,
     correlation,
     first_places,
     locate_unseen,
@@ -40,12 +40,12 @@ from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
 from evermap.slam.space.map_consensus import cost_in_map, start_by_consensus
 from evermap.slam.space.marginal import log_marginal_likelihood
-from evermap.slam.space.moved_within import MovedWithin, list_movers, superseded
+from evermap.slam.space.moved_within import MovedWithin, find_superseded, list_movers
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.range_noise import with_range_noise
 from evermap.slam.space.repair import repaired
 from evermap.slam.space.smoother import SpatialSmoother
-from evermap.slam.space.starts import by_constellations, lost_frames
+from evermap.slam.space.starts import by_constellations, find_lost_frames
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 FREE = np.repeat([1e3, ANY_RAD], 3)
@@ -110,7 +110,7 @@ class SpatialSolved:
     @property
     def left(self) -> BoolArray:
         """(P,) places that their landmarks have left."""
-        return superseded(self.moves, len(self.identity)) | has_left(self.bodies, len(self.identity))
+        return find_superseded(self.moves, len(self.identity)) | has_left(self.bodies, len(self.identity))
 
 
 def solve_space(
@@ -147,7 +147,7 @@ def solve_space(
     if problem.driven:
         whole = _along(problem, intake.driven_pose, known, place)
         _, estimate = _likeliest(problem.as_points(), noise, [stepwise, whole])
-        points = converged(problem.as_points(), estimate, noise)
+        points = converge(problem.as_points(), estimate, noise)
         if of_points and not problem.steady and _is_doubtful(points):
             points = _or_better(points, by_constellations(problem.as_points(), points.noise, SEEDS))
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
@@ -156,15 +156,15 @@ def solve_space(
     elif of_points:
         estimate, _ = _likeliest(problem, noise, [stepwise, *by_constellations(problem, noise, SEEDS)])
         if _is_loosely_tied(problem):
-            begun = converged(problem, estimate, noise)
-            estimate = _or_better(begun, [_graduated(problem, noise, estimate)]).estimate
+            begun = converge(problem, estimate, noise)
+            estimate = _or_better(begun, [_graduate(problem, noise, estimate)]).estimate
     else:
-        begun = converged(problem, stepwise, noise)
+        begun = converge(problem, stepwise, noise)
         if _is_doubtful(begun) or _has_movers(begun):
             begun = _or_best(begun, by_constellations(problem, noise, SEEDS))
         estimate, noise = begun.estimate, begun.noise
     problem, estimate = _in_measured_frame(problem, estimate, framed)
-    optimum, delays = with_delays(with_range_noise(converged(problem, estimate, noise)))
+    optimum, delays = with_delays(with_range_noise(converge(problem, estimate, noise)))
     if drift is not None and counted is None and optimum.estimate.delay_s.any():
         optimum, drift = _without_lasting(optimum, drift, intake.driven_pose, in_map=scale_in_map > 0.0)
     if len(stated) and of_points and not problem.driven and (_is_doubtful(optimum) or has_contradictions(optimum)):
@@ -276,7 +276,7 @@ def _with_drift(
     elif drift.translation is not None and drift.rotation is not None:
         free = replace(problem.as_points(), prior=PlacePrior.none(), start_sigma=HELD)
         start = first_places(free, driven)
-        alone = with_range_noise(converged(free, start, noise))
+        alone = with_range_noise(converge(free, start, noise))
         free = alone.smoother.problem
         problem = problem.with_sigma_position(free.sigma_position_m)
         of_metre = in_map or _is_of_one_metre(alone.estimate, driven)
@@ -300,7 +300,7 @@ def _without_lasting(
     problem, noise = optimum.smoother.problem, start_noise(optimum.smoother.problem.settings, driven=True)
     if problem.steady or drift.translation is None or (problem.share == 1.0).all():
         return optimum, drift
-    alone = with_range_noise(converged(replace(problem, share=np.ones(len(problem.share))), optimum.estimate, noise))
+    alone = with_range_noise(converge(replace(problem, share=np.ones(len(problem.share))), optimum.estimate, noise))
     if not (in_map or _is_of_one_metre(alone.estimate, driven)):
         return optimum, drift
     if not _are_independent(alone, drift.translation):
@@ -334,7 +334,7 @@ def _likeliest_lasting(
     best, found = -np.inf, drift
     tried = [drift, drift._replace(translation=settings.steady_m, rotation=settings.steady_rad)]
     for one in tried if drift.translation != settings.steady_m else tried[:1]:
-        optimum = converged(problem, start, _with_drift_of(noise, one))
+        optimum = converge(problem, start, _with_drift_of(noise, one))
         likelihood = log_marginal_likelihood(optimum, noise, optimum.smoother.lasting(optimum.now))
         if likelihood > best:
             best, found = likelihood, one
@@ -380,23 +380,23 @@ def _with_scale_of_map(optimum: SpatialOptimum, sigma: float) -> SpatialOptimum:
     free = replace(optimum.smoother.problem, scale_sigma=sigma)
     smoother = SpatialSmoother(free, optimum.estimate.pose)
     now = smoother.linearised(optimum.estimate, optimum.noise, heavy=False)
-    step = exhausted(smoother.factorised(now).solution())
+    step = exhaust(smoother.factorised(now).solution())
     variance, worth = smoother.worth_by_stretches(smoother.after(now, step), -1)
-    if priced(float(step[-1]), variance, worth, sigma)[0] < NEEDED:
+    if price(float(step[-1]), variance, worth, sigma)[0] < NEEDED:
         return optimum
-    return converged(free, optimum.estimate, optimum.noise, heavy_rounds=0)
+    return converge(free, optimum.estimate, optimum.noise, heavy_rounds=0)
 
 
 def _with_averaged_scale(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum at the mean over an exact odometer and one whose scale is drawn from its prior.
 
-    Both are as probable beforehand; see `slam.calibration.narrowed`.
+    Both are as probable beforehand; see `slam.calibration.narrow`.
     """
     problem, smoother = optimum.smoother.problem, optimum.smoother
     variance, worth = smoother.worth_by_stretches(optimum.now, -1)
-    _, information = priced(optimum.estimate.log_scale, variance, worth, problem.scale_sigma)
+    _, information = price(optimum.estimate.log_scale, variance, worth, problem.scale_sigma)
     sober = replace(problem, scale_sigma=float(information**-0.5))
-    return converged(sober, optimum.estimate, optimum.noise, heavy_rounds=0)
+    return converge(sober, optimum.estimate, optimum.noise, heavy_rounds=0)
 
 
 def _in_shared_metre(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -405,7 +405,7 @@ def _in_shared_metre(optimum: SpatialOptimum) -> SpatialOptimum:
     problem = whole.in_shared_metre(estimate.log_scale)
     pose, place = (se3.scaled(of, np.exp(-problem.ranges_log)) for of in (estimate.pose, estimate.place))
     scaled = replace(estimate, pose=pose, place=place, log_scale=0.0)
-    return converged(problem, scaled, optimum.noise, heavy_rounds=0)
+    return converge(problem, scaled, optimum.noise, heavy_rounds=0)
 
 
 def _with_map(intake: SpatialIntake, prior_map: Landmarks | None) -> tuple[SpatialProblem, FloatArray]:
@@ -442,7 +442,7 @@ def _or_by_consensus(optimum: SpatialOptimum, stated: FloatArray) -> SpatialOpti
     free = replace(problem, prior=PlacePrior.none(), start_sigma=HELD)
     noise = start_noise(problem.settings, driven=problem.driven)
     estimate, _ = _likeliest(free, noise, by_constellations(free, noise, 1))
-    alone = converged(free, estimate, noise)
+    alone = converge(free, estimate, noise)
     found = start_by_consensus(problem, alone, stated)
     gain_nats = problem.settings.repair.gain_nats
     if found is None or found[1] > cost_in_map(optimum, stated, alone.noise) - gain_nats:
@@ -453,7 +453,7 @@ def _or_by_consensus(optimum: SpatialOptimum, stated: FloatArray) -> SpatialOpti
 def _is_doubtful(optimum: SpatialOptimum) -> bool:
     """Tell whether the odometry jumps, or there are frames in which most is taken for outliers."""
     jumps = (optimum.now.odometry_weight < optimum.smoother.problem.settings.inlier).any()
-    return bool(jumps or lost_frames(optimum.smoother.problem, optimum.now.weight).any())
+    return bool(jumps or find_lost_frames(optimum.smoother.problem, optimum.now.weight).any())
 
 
 def _has_movers(optimum: SpatialOptimum) -> bool:
@@ -468,7 +468,7 @@ def _or_better(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> Spatia
     smoother, noise, gain = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
     cost = optimum.now.cost
     for start in starts:
-        found = converged(smoother.problem, start, noise)
+        found = converge(smoother.problem, start, noise)
         there = smoother.linearised(found.estimate, noise, heavy=False).cost
         if there < cost - gain:
             optimum, cost = found, there
@@ -487,7 +487,7 @@ def _or_best(optimum: SpatialOptimum, starts: list[SpatialEstimate]) -> SpatialO
         found, there = smoother.optimum(found, noise, heavy=False, iterations=STEPS_OF_START, wanted=wanted)
         if there.cost < wanted:
             best, wanted = found, there.cost
-    return optimum if best is None else converged(smoother.problem, best, noise)
+    return optimum if best is None else converge(smoother.problem, best, noise)
 
 
 def _likeliest(
@@ -508,7 +508,7 @@ def _is_loosely_tied(problem: SpatialProblem) -> bool:
     return 3 * len(problem.kind) < LOOSE * (6 * len(problem.stamp_s) + 3 * len(problem.oriented))
 
 
-def _graduated(problem: SpatialProblem, noise: SpatialNoise, start: SpatialEstimate) -> SpatialEstimate:
+def _graduate(problem: SpatialProblem, noise: SpatialNoise, start: SpatialEstimate) -> SpatialEstimate:
     """Return values that are led from a start to the optimum by detections with less and less noise.
 
     Where views are loosely tied, each fits what the start has of the others, and none can move without the rest. Under

@@ -255,7 +255,7 @@ class _Growth:
         candidate += [*self.turn.suggest(mine, self.place[where], where)]
         if not candidate:
             return False
-        pose, cost, information, squared = _refined(
+        pose, cost, information, squared = _refine_poses(
             np.array(candidate), self.point[mine], self.covariance[mine], self.place[where], self.place_spread[where],
             mean, told, _SeenTurns.of(self.turn, mine, where),
         )  # fmt: skip
@@ -278,7 +278,7 @@ class _Growth:
                 continue
             mine = np.flatnonzero(problem.place[some] == place)
             mine = mine[np.argsort(size[mine], kind="stable")[:OBSERVED]]
-            self.place[place], self.place_spread[place] = _agreed(at[mine], spread[mine])
+            self.place[place], self.place_spread[place] = _find_agreed_point(at[mine], spread[mine])
             self.known[place] = True
             rows = problem.pose_row[some[mine]]
             variance = np.trace(self.spread[rows, 3:, 3:], axis1=1, axis2=2) / 3.0
@@ -347,7 +347,7 @@ def _grown(problem: SpatialProblem, noise: SpatialNoise, seed: int | None) -> Sp
     return locate_unseen(problem, SpatialEstimate(pose, place, np.zeros((len(problem.mount), STATES))), known)
 
 
-def located_again(
+def locate_again(
     problem: SpatialProblem, noise: SpatialNoise, estimate: SpatialEstimate, weight: FloatArray
 ) -> SpatialEstimate | None:
     """Return the values with those frames located anew that see most of what they see elsewhere; None without any.
@@ -360,10 +360,10 @@ def located_again(
         estimate: the values.
         weight: (M,) of the detections there: outliers have next to none.
     """
-    good, bad = weight > problem.settings.inlier, lost_frames(problem, weight)
+    good, bad = weight > problem.settings.inlier, find_lost_frames(problem, weight)
     if not bad.any() or bad.all():
         return None
-    bad = _closed(bad, problem.stamp_s)
+    bad = _widen_bad(bad, problem.stamp_s)
     growth = _Growth.of(problem, noise, estimate)
     growth.located, growth.pose = ~bad, estimate.pose.copy()
     growth.spread[:] = np.diag(np.repeat([SLACK_M, SLACK_M / growth.radius_m], 3) ** 2)
@@ -376,7 +376,7 @@ def located_again(
     return SpatialEstimate(growth.pose, place, estimate.state, estimate.log_scale)
 
 
-def lost_frames(problem: SpatialProblem, weight: FloatArray) -> BoolArray:
+def find_lost_frames(problem: SpatialProblem, weight: FloatArray) -> BoolArray:
     """Return (N,) frames in which most detections, and at least two, are outliers by their weights (M,)."""
     seen = np.bincount(problem.pose_row, minlength=len(problem.stamp_s))
     good = weight > problem.settings.inlier
@@ -384,7 +384,7 @@ def lost_frames(problem: SpatialProblem, weight: FloatArray) -> BoolArray:
     return np.asarray((seen - agrees >= FEWEST_LOST) & (2 * agrees < seen))
 
 
-def _closed(bad: BoolArray, stamp_s: FloatArray) -> BoolArray:
+def _widen_bad(bad: BoolArray, stamp_s: FloatArray) -> BoolArray:
     """(N,) frames that are bad, or within `NEAR_S` of such ones on both sides."""
     at = np.concatenate([[-np.inf], stamp_s[bad], [np.inf]])
     after = np.searchsorted(at, stamp_s)
@@ -496,7 +496,7 @@ class _SeenTurns:
         return each.min(axis=1).sum(axis=1), weight.sum(axis=1), (weight[..., None] * off).sum(axis=1)
 
 
-def _refined(
+def _refine_poses(
     pose: FloatArray, point: FloatArray, covariance: FloatArray, place: FloatArray, spread: FloatArray,
     mean: FloatArray, told: FloatArray, turns: _SeenTurns,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
@@ -555,7 +555,7 @@ def _linearise_poses(
     return information, right, cost, squared
 
 
-def _agreed(at: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _find_agreed_point(at: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The point (3,) that most of some (K, 3) agree on, and its covariance."""
     off = at[:, None] - at[None]
     both = np.linalg.inv(spread[:, None] + spread[None])

@@ -15,7 +15,7 @@ from evermap.config import LocalizeConfig
 from evermap.estimate.gauss_newton import Minimum, Steps
 from evermap.estimate.graph import Border, FactorBlock, Linear
 from evermap.estimate.sparse.elimination import Spread
-from evermap.estimate.sparse.system import Factorised, exhausted
+from evermap.estimate.sparse.system import Factorised, exhaust
 from evermap.geometry import se2, se3
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import (
@@ -109,7 +109,7 @@ def solve_space_together(
 
     steps = [_steps(FIRST_STEPS if round_ == 0 else STEPS_A_ROUND) for round_ in range(ROUNDS)]
     joint, start = settle(joint, start, learn, steps)
-    optima = joint.parts(exhausted(joint.minimised_in_slices(start, _steps(LAST_STEPS))))
+    optima = joint.parts(exhaust(joint.minimise_in_slices(start, _steps(LAST_STEPS))))
     found = []
     for member, by, optimum in zip(members, motion, optima, strict=True):
         online = se3.compose(by, member.solved.online_pose)
@@ -140,7 +140,7 @@ def align_robots(members: Sequence[SolvedRobot], names: Sequence[str], rules: Lo
         mine[~members[b].problem.oriented[row], 3:] = np.nan
         there[~oriented[other], 3:] = np.nan
         at, to = se2.xy_rows(row, 3), se2.xy_rows(other, 3)
-        spread = block_diag(*(_turned(alone[a], se3.rotation_of(motion[a])) for a in placed))
+        spread = block_diag(*(_turn_axes(alone[a], se3.rotation_of(motion[a])) for a in placed))
         return SharedPoints(Matches.of(mine, there, landmark=row), alone[b][np.ix_(at, at)], spread[np.ix_(to, to)])
 
     return align_frames(se3.identity(len(members)), tie, names, NEEDED, rules)
@@ -154,7 +154,7 @@ def _errors(member: SolvedRobot) -> FloatArray:
     return by_itself(member.solved.optimum).covariance_m2
 
 
-def _turned(covariance_m2: FloatArray, turn: FloatArray) -> FloatArray:
+def _turn_axes(covariance_m2: FloatArray, turn: FloatArray) -> FloatArray:
     """(3 P, 3 P) covariance in axes that are turned."""
     every = covariance_m2.reshape(len(covariance_m2) // 3, 3, -1, 3)
     return np.asarray(np.einsum("ab,ibjc,dc->iajd", turn, every, turn, optimize=True).reshape(covariance_m2.shape))
@@ -225,9 +225,9 @@ class SpatialTogether(Together[JointEstimate]):
     def parts(self, solution: Minimum[JointEstimate]) -> list[SpatialOptimum]:
         """Return what each robot has of the solution, with covariances by all."""
         structure, variable = self.graph(solution.state).structure, self.variables(self._find_known(solution.state))
-        factorised = exhausted(self.factorised_in_slices(solution.state))
+        factorised = exhaust(self.factorise_in_slices(solution.state))
         steps = np.cumsum([0, *(len(robot.problem.increment) for robot in self.robots)]).tolist()
-        spread = exhausted(factorised.spread(steps[-1]))
+        spread = exhaust(factorised.spread(steps[-1]))
         found, count = [], len(self.robots)
         for r, robot in enumerate(self.robots):
             blocks = [kind * count + r for kind in (ODOMETRY, SIGHTINGS)]

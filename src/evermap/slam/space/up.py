@@ -125,9 +125,9 @@ def decide_up(
     reference = np.zeros(3) if known is None and not _has_sign(motion, settings) else reference
     by_turns = turn_axis(motion.pose, settings)
     wheels = odometry is not None and sway_of(odometry.pose_world_robot) < settings.wheels_rad
-    found.append(_signed(by_turns, reference, "odometry" if wheels else "plane of motion", settings))
+    found.append(_choose_sign(by_turns, reference, "odometry" if wheels else "plane of motion", settings))
     by_plane = plane_axis(motion.pose[:, :3], settings)
-    found.append(_signed(by_plane, reference, "plane of motion", settings))
+    found.append(_choose_sign(by_plane, reference, "plane of motion", settings))
     up, remarks = Up(), []
     axis = min(by_plane, by_turns, key=lambda one: one.sigma_rad)
     if not any(one.source for one in found) and axis.sigma_rad < MOST_TILT_RAD:
@@ -278,7 +278,7 @@ def _mean(direction: FloatArray, source: str, settings: UpConfig) -> Up:
     return Up(mean, float(np.hypot(scatter, LEAST_RAD[source])), source)
 
 
-def _signed(axis: Axis, reference: FloatArray, source: str, settings: UpConfig) -> Up:
+def _choose_sign(axis: Axis, reference: FloatArray, source: str, settings: UpConfig) -> Up:
     """An axis in the direction of a reference (3,), which must tell it."""
     part = float(axis.direction @ reference)
     if not (np.isfinite(axis.sigma_rad) and abs(part) > settings.evident):

@@ -316,7 +316,7 @@ def _way(make: Make, site: Site, stamp_s: FloatArray, rng: np.random.Generator) 
         angles[:, :2] = 0.12 * wave[:, :2]
         angles[:, 2] += 0.6 * wave[:, 2]
     pose[:, 3:] = se3.from_angles(angles)[:, 3:]
-    return se3.normalised(pose)
+    return se3.normalise_poses(pose)
 
 
 def _driven(make: Make, twist: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -63,7 +63,7 @@ def moved(drive: Drive, row: int, shift_m: float, turn_rad: float, rng: np.rando
     pose[:3] += shift_m * side
     turned = se3.compose(se3.from_angles([0.0, 0.0, turn_rad]), se3.turn(pose[3:]))
     pose[3:] = turned[3:]
-    return se3.normalised(pose)
+    return se3.normalise_poses(pose)
 
 
 def moves(count: int, at_share: float = -math.inf, shift_m: float = 0.9, turn_rad: float = 0.0) -> Any:

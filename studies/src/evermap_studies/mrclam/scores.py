@@ -103,7 +103,7 @@ def odometry_between_true_poses(recording: Recording, result: SlamResult) -> Pos
     the run's own does. What is left is beyond every map: it is what this odometry says wrongly where nothing else
     speaks. None where truth does not cover the sightings.
     """
-    from evermap.slam.bridge import bridged
+    from evermap.slam.bridge import bridge_poses
     from evermap.slam.calibration import NAMES
     from evermap.slam.intake import prepare
     from evermap.slam.kernels import NOISE_NAMES
@@ -129,7 +129,7 @@ def odometry_between_true_poses(recording: Recording, result: SlamResult) -> Pos
     )
     exact = np.zeros((len(known_s), 3, 3))
     states = np.array([value[name] for name in NAMES])
-    pose, covariance = bridged(
+    pose, covariance = bridge_poses(
         stamps - prepared.start_s,
         known_s - prepared.start_s,
         true_pose,

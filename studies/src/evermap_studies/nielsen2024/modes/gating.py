@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.batch import sighted_at
+from evermap.slam.batch import sight_at
 from evermap.slam.kernels import N_SENSOR, N_STATES, detection_residual, kernel
 from evermap.slam.planar_filter import WIDTH
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
@@ -150,7 +150,7 @@ def with_births(
         groups = _groups(problem, estimate, marginals, noise, mine, threshold)
         for group in sorted(groups, key=len, reverse=True)[: max(0, room[landmark])]:
             pose, reading = estimate.pose[problem.pose_row[group]], problem.reading[group]
-            at.append(np.median(sighted_at(pose, reading, estimate.states, problem.mount), axis=0))
+            at.append(np.median(sight_at(pose, reading, estimate.states, problem.mount), axis=0))
             whose.append(int(landmark))
     if not at:
         return problem, estimate, modes, lost
@@ -197,7 +197,7 @@ def _at_sighting(
     By the implicit function: the residual stays zero when pose, landmark and reading move together.
     """
     pose = estimate.pose[problem.pose_row[m]]
-    at = sighted_at(pose, problem.reading[m], estimate.states, problem.mount)
+    at = sight_at(pose, problem.reading[m], estimate.states, problem.mount)
     _, by_pose, by_place = _residual(problem, estimate, m, at)
     back = np.linalg.inv(by_place)
     sigma = noise.of_detections(problem.sigma_given[m])
