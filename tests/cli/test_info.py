@@ -131,8 +131,8 @@ def test_a_mistake_is_one_line(name: str, content: bytes | None, words: str, tmp
 
 def test_a_run_is_told_without_loading_numbers(place: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from evermap.cli.info import _told\n"
-        f"_told(Path({str(place / 'run')!r}), None)\n"
+        "import sys; from pathlib import Path; from evermap.cli.info import _ask\n"
+        f"_ask(Path({str(place / 'run')!r}), None)\n"
         "print(sorted({'numpy', 'scipy', 'numba', 'pyarrow'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -51,7 +51,7 @@ def info(
       evermap info site.evermap --json
       evermap info out/monday
     """
-    told = _told(path, robot)
+    told = _ask(path, robot)
     if as_json:
         print_json({"path": str(path), "kind": told.kind, "bytes": _size(path), **told.facts})
         return
@@ -63,7 +63,7 @@ def info(
         warn(remark)
 
 
-def _told(path: Path, robot: int | None) -> Described:
+def _ask(path: Path, robot: int | None) -> Described:
     """Ask what understands the path; the cheapest question first.
 
     Raises:

@@ -88,7 +88,7 @@ def learn(
             )
         settings_told = {"living": {"lifetimes": chosen.living.lifetimes.to_dict()}}
         told = {"command": command_line(), "input": ", ".join(sites), "config": settings_told}
-        summary = folder.finish({**told, **_written(folder, Company.of(found), list(sites))})
+        summary = folder.finish({**told, **_write_company(folder, Company.of(found), list(sites))})
     if as_json:
         print_json(summary)
         return
@@ -136,7 +136,7 @@ def _store_model(store: str) -> list[tuple[str, str]]:
         raise ConfigError("is not the address of a database", field="store", hint=hint) from None
 
 
-def _written(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:
+def _write_company(folder: RunFolder, company: Company, names: list[str]) -> dict[str, Any]:
     """Write the files of a company and its sites; return the results for the summary."""
     from evermap.existence.models import save_lifetimes
     from evermap.types import json_number

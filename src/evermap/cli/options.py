@@ -245,7 +245,7 @@ def _option(name: str, ctx: Any) -> str | None:
     An argument `step_s` is the option whose parameter is called so; a configuration key `persist.step_s` is, too, if
     that option was given.
     """
-    shown = {param.name: _shown(param) for param in ctx.command.params}
+    shown = {param.name: _name_parameter(param) for param in ctx.command.params}
     shown |= {name: shown[other] for name, other in _OTHER_NAMES.items() if other in shown}
     leaf = name.rpartition(".")[2]
     if leaf != name and "COMMANDLINE" not in str(ctx.get_parameter_source(_OTHER_NAMES.get(leaf, leaf))):
@@ -253,6 +253,6 @@ def _option(name: str, ctx: Any) -> str | None:
     return shown.get(leaf)
 
 
-def _shown(param: Any) -> str:
+def _name_parameter(param: Any) -> str:
     """Return how a parameter is called on the command line: its longest option, or the name of an argument."""
     return str(max(param.opts, key=len) if param.param_type_name == "option" else param.metavar or param.name.upper())

@@ -186,7 +186,7 @@ class OneStay(Shown):
         asked = Instants.of_looks(looks) if instants is None else instants
         birth_row = _birth_rows(looks)
         birth_s = births(looks)
-        feature, time, look, instant = _merged(looks, asked)
+        feature, time, look, instant = _merge_looks(looks, asked)
         born = time >= birth_s[feature]  # false where there never is a birth
         feature, time, look, instant = feature[born], time[born], look[born], instant[born]
 
@@ -262,7 +262,7 @@ def _birth_rows(looks: Looks) -> IntArray:
     return row
 
 
-def _merged(looks: Looks, asked: Instants) -> tuple[IntArray, FloatArray, IntArray, IntArray]:
+def _merge_looks(looks: Looks, asked: Instants) -> tuple[IntArray, FloatArray, IntArray, IntArray]:
     """Looks and instants as one list by feature and time, looks first: feature, time, row in each table or -1."""
     n_looks, n_asked = len(looks.stamp_s), len(asked.stamp_s)
     feature = np.concatenate([looks.feature, feature_of(asked.first)])

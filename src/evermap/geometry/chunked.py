@@ -241,7 +241,7 @@ class ChunkedCovariance:
         pair = np.column_stack([code // n_chunks, code % n_chunks])
         index = _Index.of(chunk, pair, self.dim)
         is_fresh = touched[pair].any(axis=1)
-        fresh = self._told(index, np.flatnonzero(is_fresh), told, of_old, new)
+        fresh = self._add_fresh(index, np.flatnonzero(is_fresh), told, of_old, new)
         was = np.where(is_fresh, -1, np.searchsorted(old_code, code))
         each = np.empty((len(chunk), self.dim, self.dim))
         each[kept] = self.each_m2[new.was[kept]]
@@ -251,7 +251,7 @@ class ChunkedCovariance:
                 each[index.points(a)] = _of_each(block.reshape(self.dim * len(index.points(a)), -1), self.dim)
         return type(self)(chunk, parent, centre, pair, each, self._parts(index, fresh, was))
 
-    def _told(
+    def _add_fresh(
         self, index: _Index, fresh: IntArray, told: BoolArray, of_old: IntArray, new: Update
     ) -> dict[int, FloatArray]:
         """Blocks of the pairs `fresh` of the new covariance."""

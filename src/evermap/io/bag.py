@@ -438,7 +438,7 @@ def detections_of(
         score=ones.score,
         size_m=ones.size,
     )
-    return with_tag_poses(_placed(path, found, ones, sensors, settings), sensors, warnings)
+    return with_tag_poses(_with_poses(path, found, ones, sensors, settings), sensors, warnings)
 
 
 def stamps_of(content: BagContent, topic: str, clock: str) -> FloatArray:
@@ -519,7 +519,7 @@ def _identities(seen: SeenColumns, sensor: IntArray, settings: BagSettings, name
     return identity
 
 
-def _placed(
+def _with_poses(
     path: Path,
     found: SpatialDetections,
     seen: SeenColumns,

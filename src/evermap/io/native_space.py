@@ -243,7 +243,7 @@ def _detections(
     if form is POINT:
         columns |= _points(table, columns["sensor"], rig)
     else:
-        columns |= _placed(table)
+        columns |= _read_places(table)
     detections = spatial_detections(frame, **columns, **features_of(table))
     if table.has_any(CORNERS):
         detections = _add_corners(table, detections, rig)
@@ -280,7 +280,7 @@ def _sensor_rows(table: Table, rig: Rig) -> IntArray:
     return np.zeros(len(table), dtype=np.int64)
 
 
-def _placed(table: Table) -> dict[str, FloatArray]:
+def _read_places(table: Table) -> dict[str, FloatArray]:
     """Position, orientation and covariance where the table gives them."""
     found: dict[str, FloatArray] = {}
     if table.has_any(AT):

@@ -164,7 +164,7 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
     if detections.features is not None:
         tables["detections"] |= dict(zip(detections.feature_names, detections.features.T, strict=True))
     if isinstance(detections, Detections):
-        tables["detections"] |= _given(_columns(detections, "sigma_range_m", "sigma_bearing_rad"))
+        tables["detections"] |= _keep_known(_columns(detections, "sigma_range_m", "sigma_bearing_rad"))
     tables["frames"] = {"stamp_s": recording.frames.stamp_s}
     if recording.truth is not None:
         tables["truth"] = _write_poses(recording.truth)
@@ -178,7 +178,7 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
     for table in recording.measurements:
         columns = measurement_columns(table)
         place = {"landmark_id": _write_names(table.landmark_id, called)} if "landmark_id" in columns else {}
-        tables[table.kind] = _given({**columns, **place})
+        tables[table.kind] = _keep_known({**columns, **place})
     return tables
 
 
@@ -195,7 +195,7 @@ def _columns(table: Any, *names: str) -> dict[str, FloatArray]:
 def _odometry(odometry: Odometry | SpatialOdometry) -> dict[str, FloatArray]:
     if isinstance(odometry, Odometry):
         return _columns(odometry, "stamp_s", "forward_mps", "lateral_mps", "angular_radps")
-    return {**_write_poses(odometry), **_given(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
+    return {**_write_poses(odometry), **_keep_known(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
 
 
 def _in_plane(recording: Recording) -> dict[str, Any]:
@@ -220,11 +220,11 @@ def _in_space(recording: SpatialRecording) -> dict[str, Any]:
         "sensor": [sensors[row] for row in detections.sensor.tolist()],
         "landmark_id": _write_names(detections.landmark_id, recording.landmark_names),
         **dict(zip(AT, detections.position_sensor_m.T, strict=True)),
-        **_given(details),
+        **_keep_known(details),
     }
 
 
-def _given(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
+def _keep_known(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
     """The columns in which anything is known."""
     return {name: column for name, column in columns.items() if not np.all(np.isnan(column))}
 

@@ -91,8 +91,8 @@ def write_grid(landmarks: Landmarks, path: str | Path, *, cell_m: float = 0.05, 
         DataError: there is no landmark.
         ConfigError: the grid would have more than `MOST_CELLS` cells, or it is not known where up is.
     """
-    occupied, origin_m = _drawn(landmarks, landmarks.p_exists, Path(path), cell_m, radius_m)
-    return _written(Path(path), occupied, origin_m, cell_m, (0.01, 0.99), _frame_of(landmarks))
+    occupied, origin_m = _draw_cells(landmarks, landmarks.p_exists, Path(path), cell_m, radius_m)
+    return _write_image(Path(path), occupied, origin_m, cell_m, (0.01, 0.99), _frame_of(landmarks))
 
 
 def write_speed_mask(
@@ -114,12 +114,12 @@ def write_speed_mask(
         DataError, ConfigError: as `write_grid`.
     """
     slower = np.rint(100.0 * np.minimum(p_wrong, 1.0 - LEAST_SPEED)) / 100.0
-    drawn, origin_m = _drawn(landmarks, slower, Path(path), cell_m, radius_m)
+    drawn, origin_m = _draw_cells(landmarks, slower, Path(path), cell_m, radius_m)
     about = "Mask of Nav2's speed filter; its CostmapFilterInfo: type 1, base 100.0, multiplier -1.0"
-    return _written(Path(path), drawn, origin_m, cell_m, (0.0, 1.0), f"# {about}\n{_frame_of(landmarks)}")
+    return _write_image(Path(path), drawn, origin_m, cell_m, (0.0, 1.0), f"# {about}\n{_frame_of(landmarks)}")
 
 
-def _drawn(
+def _draw_cells(
     landmarks: Landmarks, value: FloatArray, path: Path, cell_m: float, radius_m: float
 ) -> tuple[FloatArray, list[float]]:
     """(H, W) the greatest value (L,) of what covers each cell, from south to north, and the corner of the first."""
@@ -152,7 +152,7 @@ def _frame_of(landmarks: Landmarks) -> str:
     return f"# Frame: that of the map, turned so that up is z: qx, qy, qz, qw = {axes}\n"
 
 
-def _written(
+def _write_image(
     path: Path,
     value: FloatArray,
     origin_m: list[float],

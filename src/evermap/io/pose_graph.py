@@ -439,7 +439,7 @@ def _landmark_id(key: Key, names: dict[int, str]) -> int:
     return landmark_id_of(text)
 
 
-def _seen(graph: _Graph, kind: str, row: dict[Key, int]) -> list[_Edge]:
+def _list_sightings(graph: _Graph, kind: str, row: dict[Key, int]) -> list[_Edge]:
     """Return the edges of a kind from a pose of this robot to a landmark, in the order of the poses."""
     edges = [edge for edge in graph.of(kind) if edge.first in row and edge.second not in row]
     edges = [edge for edge in edges if edge.second not in graph.poses or edge.second[0].lower() == "l"]
@@ -452,7 +452,9 @@ def _in_plane(
     twist = se2.log(steps) / np.diff(stamp_s)[:, None]
     forward, lateral, angular = np.ascontiguousarray(np.vstack([twist, twist[-1:]]).T)
     clock = _clock(stamp_s)
-    seen, polar, aimed, ranged = (_seen(graph, kind, row) for kind in ("sighting", "polar", "bearing", "range"))
+    seen, polar, aimed, ranged = (
+        _list_sightings(graph, kind, row) for kind in ("sighting", "polar", "bearing", "range")
+    )
     at = np.array([edge.values for edge in seen]).reshape(-1, 2)
     reading = np.vstack(
         [
@@ -517,8 +519,8 @@ def _in_space(
     clock = _clock(stamp_s)
     pose = accumulate(steps)
     # tags with an orientation are poses of gtsam that are called l7
-    tags = [edge for edge in _seen(graph, "move", row) if edge.second[0].lower() == "l"]
-    edges = sorted([*_seen(graph, "sighting", row), *tags], key=lambda edge: row[edge.first])
+    tags = [edge for edge in _list_sightings(graph, "move", row) if edge.second[0].lower() == "l"]
+    edges = sorted([*_list_sightings(graph, "sighting", row), *tags], key=lambda edge: row[edge.first])
     used = sorted({edge.sensor for edge in edges if edge.sensor in graph.offsets})
     sensors = tuple(
         SpatialSensor(name=f"sensor{key[1]}", mount_robot_sensor=tuple(graph.offsets[key].tolist())) for key in used
@@ -549,7 +551,7 @@ def _in_space(
         truth=truth,
         true_landmarks=_survey(graph, names, clock),
         clock=clock,
-        measurements=_make_measurements([], _seen(graph, "range", row), row, stamp_s, names),
+        measurements=_make_measurements([], _list_sightings(graph, "range", row), row, stamp_s, names),
     )
 
 

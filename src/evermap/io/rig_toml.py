@@ -80,7 +80,7 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
         values: dict[str, Any] = {}
         for section, keys in _LIMITS.items():
             known = ("kind", *keys) if section == "sensor" else tuple(keys)
-            content = _known(reader, section, reader.document.get(section, {}), known)
+            content = _check_keys(reader, section, reader.document.get(section, {}), known)
             values |= reader.limited(section, content, keys)
         values["kind"] = reader.choice("sensor", "kind", SensorKind, UNKNOWN_KIND)
         mount = _mount(reader, "mount", reader.section("mount", _MOUNT))
@@ -141,7 +141,7 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
     sensors, baselines = [], []
     for name, content in listed.items():
         section = f"camera.{name}"
-        _known(reader, section, content, (*_CAMERA, *also))
+        _check_keys(reader, section, content, (*_CAMERA, *also))
         values: dict[str, Any] = reader.limited(section, content, _OF_CAMERA)
         if "mount" in content:
             inner = f"{section}.mount"
@@ -157,7 +157,7 @@ def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also:
     return Rig(settings, tuple(sensors), tuple(baselines), size_m, sizes)
 
 
-def _known(reader: TomlReader, section: str, content: Any, known: tuple[str, ...]) -> dict[str, Any]:
+def _check_keys(reader: TomlReader, section: str, content: Any, known: tuple[str, ...]) -> dict[str, Any]:
     """Return a section without unknown keys; one that is known in the plane only gets its own hint."""
     for key in content if isinstance(content, dict) else ():
         if key in NOT_IN_SPACE and key not in known:

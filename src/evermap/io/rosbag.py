@@ -142,7 +142,7 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
     except ImportError:
         raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
     try:
-        with tempfile.TemporaryDirectory() as folder, _open_bag(_unpacked(path, Path(folder))) as bag:
+        with tempfile.TemporaryDirectory() as folder, _open_bag(_unpack(path, Path(folder))) as bag:
             foreign: dict[str, Topic] = getattr(bag, "foreign", {})
             if foreign and not bag.connections:
                 encodings = ", ".join(sorted({one.encoding for one in foreign.values()}))
@@ -289,7 +289,7 @@ def stamp_of(message: Any) -> float:
     return seconds(message.header.stamp)
 
 
-def _unpacked(path: Path, folder: Path) -> Path:
+def _unpack(path: Path, folder: Path) -> Path:
     """The bag itself, in `folder` where it was packed: the package reads from files only."""
     if path.suffix != ".bz2":
         return path

@@ -96,7 +96,7 @@ def _trajectory(files: FileSet, name: str, warnings: list[str]) -> Trajectory | 
 def _detections(files: FileSet, names: list[str], stamp_s: FloatArray, warnings: list[str]) -> SpatialDetections:
     frames, poses, kinds, lines = [], [], [], []
     for kind, name in enumerate(names):
-        rows = _seen(files, f"detections_{name}", warnings)
+        rows = _keep_seen(files, f"detections_{name}", warnings)
         somewhere = rows.values[:, 1:4].any(axis=1)
         if not somewhere.all():
             degenerate = counted(int(np.sum(~somewhere)), "detection")
@@ -120,7 +120,7 @@ def _detections(files: FileSet, names: list[str], stamp_s: FloatArray, warnings:
     )
 
 
-def _seen(files: FileSet, name: str, warnings: list[str]) -> Rows:
+def _keep_seen(files: FileSet, name: str, warnings: list[str]) -> Rows:
     """The rows of a file that are not seven zeros."""
     rows = pose_rows(*_file(files, name), warnings, zeros=True)
     return rows[np.flatnonzero(rows.values[:, 1:].any(axis=1))]
@@ -141,7 +141,7 @@ def _true_landmarks(files: FileSet, names: list[str], truth: Trajectory, warning
     for name in names:
         if _name(files, f"object_truth_{name}") is None:
             continue
-        rows = _seen(files, f"object_truth_{name}", warnings)
+        rows = _keep_seen(files, f"object_truth_{name}", warnings)
         both = np.isin(rows.column(0).round(6), truth.stamp_s.round(6))
         at = np.searchsorted(truth.stamp_s, rows.column(0)[both] - SAME_STAMP_S)
         if len(at):

@@ -162,7 +162,7 @@ class Inbox:
             frames, self._kept, self._n_written = self._kept, [], until
             self._forget()
             classes, texts = tuple(self._classes), dict(self._texts)
-        return self._recorded(odometry, frames, classes, texts)
+        return self._record(odometry, frames, classes, texts)
 
     def cut(self, name: str) -> None:
         """Begin another recording after the last frame that was given out; its odometry begins some seconds before."""
@@ -257,11 +257,11 @@ class Inbox:
         )
         raise InputError(problem, field="stamp_s", hint="one clock for all readings, or a larger live.reorder_s")
 
-    def _recorded(
+    def _record(
         self, odometry: FloatArray, frames: list[LiveFrame], classes: tuple[str, ...], texts: dict[int, str]
     ) -> Any:
         """Return a recording of some readings."""
-        return _recorded(self._about, odometry, frames, classes, texts)
+        return _record(self._about, odometry, frames, classes, texts)
 
     def _rows(self, *columns: Any) -> FloatArray:
         """(M, 6) rows of the detections of a frame."""
@@ -318,7 +318,7 @@ def joined(parts: Sequence[AnyRecording]) -> AnyRecording:
     return joined_up
 
 
-def _recorded(
+def _record(
     about: Recording, odometry: FloatArray, frames: list[LiveFrame], classes: tuple[str, ...], texts: dict[int, str]
 ) -> Recording:
     stamp_s, forward_mps, lateral_mps, angular_radps = _columns(odometry)

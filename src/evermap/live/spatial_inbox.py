@@ -104,7 +104,7 @@ class SpatialInbox(Inbox):
             check_frame_in_space(detections_of(rows, np.zeros(count, dtype=np.int64)), len(self._rig))
         return rows
 
-    def _recorded(
+    def _record(
         self, odometry: FloatArray, frames: list[LiveFrame], classes: tuple[str, ...], texts: dict[int, str]
     ) -> Any:
         about, clock = self._about, self._about.clock

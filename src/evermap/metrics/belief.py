@@ -80,7 +80,7 @@ def belief_scores(p_present: ArrayLike, present: ArrayLike) -> BeliefScores:
     Raises:
         InputError: shapes that differ, a probability outside [0, 1], or a truth that is neither 1 nor 0.
     """
-    belief, there = _checked(p_present, present)
+    belief, there = _check(p_present, present)
     if len(belief) == 0:
         return BeliefScores(0, *[float("nan")] * 7)
     error = belief - there
@@ -110,7 +110,7 @@ def reliability(p_present: ArrayLike, present: ArrayLike, *, bins: int = BINS) -
     Raises:
         InputError: as `belief_scores`.
     """
-    belief, there = _checked(p_present, present)
+    belief, there = _check(p_present, present)
     edge = np.arange(bins + 1) / bins
     bin_ = np.searchsorted(edge[1:-1], belief, side="right")
     count = np.bincount(bin_, minlength=bins)
@@ -120,7 +120,7 @@ def reliability(p_present: ArrayLike, present: ArrayLike, *, bins: int = BINS) -
     return Reliability(edge, count, mean, share)
 
 
-def _checked(p_present: ArrayLike, present: ArrayLike) -> tuple[FloatArray, BoolArray]:
+def _check(p_present: ArrayLike, present: ArrayLike) -> tuple[FloatArray, BoolArray]:
     belief = np.asarray(p_present, dtype=np.float64)
     truth = np.asarray(present, dtype=np.float64)
     if belief.ndim != 1 or belief.shape != truth.shape:

@@ -119,13 +119,13 @@ def _rows(random: np.random.Generator) -> Iterator[tuple[str, ...]]:
                 there = [(s.kind, np.array([*s.place, 0.5])) for s in stays if s.begin_h <= time_h < s.end_h]
                 if walker:
                     there.append(("person", np.array([28.0 - 1.2 * _STEP_S * k, 1.5, 0.9])))
-                seen = _seen(random, there, sensor)
+                seen = _draw_detections(random, there, sensor)
                 rows = [(kind, *(f"{value:.3f}" for value in position), str(_SIGMA_M)) for kind, position in seen]
                 for cells in rows or [("", "", "", "", "")]:
                     yield (f"{time_h * _HOUR_S:.1f}", *cells, *(f"{value:.2f}" for value in sensor))
 
 
-def _seen(
+def _draw_detections(
     random: np.random.Generator, there: list[tuple[str, FloatArray]], sensor: FloatArray
 ) -> Iterator[tuple[str, FloatArray]]:
     """Return detections of present objects, and some false ones."""

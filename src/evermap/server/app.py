@@ -60,7 +60,7 @@ def create_app(server: Server) -> FastAPI:
     return app
 
 
-def _told(request: Request, site: str, make: Callable[[SqlStore], Any]) -> Response:
+def _answer_from(request: Request, site: str, make: Callable[[SqlStore], Any]) -> Response:
     """Answer from a map alone, unchanged until there is a newer revision."""
     asked = f"{request.url.path}?{request.url.query}"
     tag, found = server_of(request).sites.answer(site, asked, lambda store: bytes(PlainJSON(make(store)).body))
@@ -265,13 +265,13 @@ def list_revisions(
     def listed(store: SqlStore) -> list[dict[str, Any]]:
         return [describe_revision(item, config=config) for item in read_log(store) if item.number > (since or 0)][:most]
 
-    return _told(request, site, listed)
+    return _answer_from(request, site, listed)
 
 
 @router.get("/maps/{site}/diff")
 def diff(request: Request, site: Site, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> Response:
     """Return the changes between two revisions."""
-    return _told(request, site, lambda store: map_dicts.diff_dict(between(store, a or 0, b)))
+    return _answer_from(request, site, lambda store: map_dicts.diff_dict(between(store, a or 0, b)))
 
 
 @router.get("/maps/{site}/changes")
@@ -282,7 +282,7 @@ def changes(request: Request, site: Site, _: Reader, since: AtRevision = 0) -> R
         told = [one for one in story_of(store) if one.revision > (since or 0)]
         return [{"revision": one.revision, **change_dict(change)} for one in told for change in one.changes]
 
-    return _told(request, site, listed)
+    return _answer_from(request, site, listed)
 
 
 class LandmarkQuery(BaseModel):
@@ -318,20 +318,20 @@ def landmarks(request: Request, site: Site, _: Reader, asked: Annotated[Landmark
             "landmarks": [item for item in found if asked.holds(item)],
         }
 
-    return _told(request, site, listed)
+    return _answer_from(request, site, listed)
 
 
 @router.get("/maps/{site}/landmarks/{landmark}/why")
 def why(request: Request, site: Site, landmark: str, _: Reader, revision: AtRevision = None) -> Response:
     """Return why a landmark is believed to exist or gone."""
-    return _told(request, site, lambda store: map_dicts.answer_dict(of_landmark(store, landmark, revision)))
+    return _answer_from(request, site, lambda store: map_dicts.answer_dict(of_landmark(store, landmark, revision)))
 
 
 @router.get("/maps/{site}/poses")
 def poses(request: Request, site: Site, _: Reader, revision: AtRevision = None, at_s: Number = None) -> Response:
     """Return where each robot was in its newest session up to `at_s`, and its path in it."""
     until_s = math.inf if at_s is None else at_s
-    return _told(request, site, lambda store: {"robots": map_dicts.pose_dicts(store, revision, until_s)})
+    return _answer_from(request, site, lambda store: {"robots": map_dicts.pose_dicts(store, revision, until_s)})
 
 
 @router.get("/maps/{site}/lifetimes")
@@ -343,7 +343,7 @@ def lifetimes(request: Request, site: Site, _: Reader, revision: AtRevision = No
         known = {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
         return known | map_dicts.hours_dict(living)
 
-    return _told(request, site, told)
+    return _answer_from(request, site, told)
 
 
 @router.get("/maps/{site}/file", **_as("application/vnd.sqlite3"))

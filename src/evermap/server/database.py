@@ -47,7 +47,7 @@ _GROWTH = 4
 metadata = sa.MetaData()
 
 
-def _given(**kinds: Any) -> list[sa.Column[Any]]:
+def _columns_of(**kinds: Any) -> list[sa.Column[Any]]:
     """Return columns that no row may leave empty."""
     return [sa.Column(name, kind, nullable=False) for name, kind in kinds.items()]
 
@@ -56,19 +56,19 @@ def _number_rows() -> sa.Column[int]:
     return sa.Column("id", sa.Integer, primary_key=True)
 
 
-_server = sa.Table("server", metadata, *_given(version=sa.Integer))
+_server = sa.Table("server", metadata, *_columns_of(version=sa.Integer))
 _token = sa.Table(
     "token",
     metadata,
     sa.Column("digest", sa.LargeBinary, primary_key=True),
     sa.Column("name", sa.Text, nullable=False, unique=True),
-    *_given(role=sa.Text, created_at=sa.Text),
+    *_columns_of(role=sa.Text, created_at=sa.Text),
 )
 _job = sa.Table(
     "job",
     metadata,
     _number_rows(),
-    *_given(site=sa.Text, digest=sa.Text, n_bytes=sa.Integer, robot=sa.Text),
+    *_columns_of(site=sa.Text, digest=sa.Text, n_bytes=sa.Integer, robot=sa.Text),
     sa.Column("state", sa.Text, nullable=False, index=True),
     sa.Column("reason", sa.Text, nullable=False, default=""),
     sa.Column("verdict", sa.Text, nullable=False, server_default=""),
@@ -76,20 +76,27 @@ _job = sa.Table(
     sa.Column("tries", sa.Integer, nullable=False, default=0),
     sa.Column("worker", sa.Text, nullable=False, default=""),
     sa.Column("lease_s", sa.Float, nullable=False, default=0.0),
-    *_given(created_at=sa.Text, changed_at=sa.Text),
+    *_columns_of(created_at=sa.Text, changed_at=sa.Text),
     sa.UniqueConstraint("site", "digest"),
 )
 _open_job = _job.c.state.in_(["queued", "working", "aside"])
 _open_jobs = sa.Index("ix_job_open", _job.c.id, postgresql_where=_open_job, sqlite_where=_open_job)
 """Those that may be leased: of a million sessions that are entered, no lease looks at one."""
-_payload = sa.Table("payload", metadata, sa.Column("job", sa.Integer, primary_key=True), *_given(data=sa.LargeBinary))
+_payload = sa.Table(
+    "payload", metadata, sa.Column("job", sa.Integer, primary_key=True), *_columns_of(data=sa.LargeBinary)
+)
 _approval = sa.Table(
-    "approval", metadata, _number_rows(), *_given(site=sa.Text, revision=sa.Integer, who=sa.Text, at=sa.Text)
+    "approval", metadata, _number_rows(), *_columns_of(site=sa.Text, revision=sa.Integer, who=sa.Text, at=sa.Text)
 )
 _robot = sa.Table(
-    "robot", metadata, sa.Column("name", sa.Text, primary_key=True), *_given(maps=sa.Text, told=sa.Integer, at=sa.Text)
+    "robot",
+    metadata,
+    sa.Column("name", sa.Text, primary_key=True),
+    *_columns_of(maps=sa.Text, told=sa.Integer, at=sa.Text),
 )
-_audit = sa.Table("audit", metadata, _number_rows(), *_given(at=sa.Text, who=sa.Text, what=sa.Text, status=sa.Integer))
+_audit = sa.Table(
+    "audit", metadata, _number_rows(), *_columns_of(at=sa.Text, who=sa.Text, what=sa.Text, status=sa.Integer)
+)
 
 
 def _migrate(connection: sa.Connection) -> int | None:
@@ -246,7 +253,7 @@ class Database:
         told = {"site": site, "digest": digest, "n_bytes": len(data), "robot": robot, "state": JobState.QUEUED.value}
         try:
             with self._writer.begin() as connection:
-                known = self._known(connection, site, digest)
+                known = self._find_known(connection, site, digest)
                 if known is not None:
                     return known, False
                 row = sa.insert(_job).values(**told, created_at=now, changed_at=now).returning(*_SHOWN)
@@ -256,11 +263,11 @@ class Database:
                 return job, True
         except IntegrityError:  # sent twice at the same time
             with self._engine.begin() as connection:
-                known = self._known(connection, site, digest)
+                known = self._find_known(connection, site, digest)
             assert known is not None
             return known, False
 
-    def _known(self, connection: sa.Connection, site: str, digest: str) -> Job | None:
+    def _find_known(self, connection: sa.Connection, site: str, digest: str) -> Job | None:
         known = sa.select(*_SHOWN).where(_job.c.site == site, _job.c.digest == digest)
         return next(map(_job_of, connection.execute(known).mappings()), None)
 

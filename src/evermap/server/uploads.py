@@ -192,7 +192,7 @@ def recording_of(data: bytes, digest: str) -> AnyRecording:
         try:
             with _open_files(data, UploadLimits()) as files:
                 is_bag = any(name.endswith((*_BAGS,)) for name in files)
-                bag = _unpacked(files, path) if is_bag else {}
+                bag = _unpack_bag(files, path) if is_bag else {}
             if is_bag:
                 remarks = _convert(bag, path)
             else:
@@ -206,7 +206,7 @@ def recording_of(data: bytes, digest: str) -> AnyRecording:
     return replace(recording, source=f"upload:{digest}", warnings=(*remarks, *recording.warnings))
 
 
-def _unpacked(parts: _Files, out: Path) -> dict[str, Path]:
+def _unpack_bag(parts: _Files, out: Path) -> dict[str, Path]:
     """Write the files of a bag into a folder beside `out`; returns them by name."""
     bag = out.with_name("bag") / out.name
     bag.mkdir(parents=True)

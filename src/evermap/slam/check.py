@@ -203,7 +203,7 @@ def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
         "detections": {
             "count": len(detections),
             "without_identity": int(np.sum(~known)),
-            **(_find_seen_in_space(recording) if is_in_space(recording) else _seen(recording)),
+            **(_find_seen_in_space(recording) if is_in_space(recording) else _find_seen(recording)),
         },
         "landmarks": {
             "count": len(of_landmark),
@@ -242,7 +242,7 @@ def _velocity(odometry: SpatialOdometry) -> FloatArray:
     return np.asarray(se3.log(se3.between(pose[:-1], pose[1:])).T / np.diff(odometry.stamp_s))
 
 
-def _seen(recording: Recording) -> dict[str, Any]:
+def _find_seen(recording: Recording) -> dict[str, Any]:
     sensor, detections = recording.sensor, recording.detections
     aside = detections.bearing_rad > sensor.bearing_max_rad
     aside |= detections.bearing_rad < sensor.bearing_min_rad

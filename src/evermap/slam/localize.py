@@ -250,7 +250,7 @@ class BaseLocalizer(Shown, ABC):
         """Place, innovation and weight of the detections `used`; `new` ones are of landmarks that the map lacks."""
         met = np.array([m for m in new.tolist() if int(seen.landmark_id[m]) in self._new], dtype=np.int64)
         which, count = np.append(used, met), len(used)
-        row = self._chosen(first, last, seen, used)
+        row = self._choose_places(first, last, seen, used)
         row = np.append(row, np.array([self._new[int(seen.landmark_id[m])] for m in met], dtype=np.int64))
         self._filter.bring(row)
         nis, weight, _ = self._update_by(row, seen, which)
@@ -276,7 +276,7 @@ class BaseLocalizer(Shown, ABC):
             self._new[name] = row
             self._log_p, self._believed = np.append(self._log_p, 0.0), np.append(self._believed, 0.0)
 
-    def _chosen(self, first: IntArray, last: IntArray, seen: Any, used: IntArray) -> IntArray:
+    def _choose_places(self, first: IntArray, last: IntArray, seen: Any, used: IntArray) -> IntArray:
         """(M,) known place at which each landmark was seen: the most probable one (max-mixture, MATH.md section 5)."""
         count = last - first
         if np.count_nonzero(count > 1) == 0:

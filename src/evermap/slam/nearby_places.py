@@ -191,7 +191,7 @@ class NearbyPlaces:
         """Return (k, D) by which places (k, W) differ from others, as the covariance counts it."""
         return places - others
 
-    def _moved(self, place: FloatArray, by: FloatArray) -> FloatArray:
+    def _move_place(self, place: FloatArray, by: FloatArray) -> FloatArray:
         """Return a place (W,) that differs from another by (D,)."""
         return np.asarray(place + by)
 
@@ -268,7 +268,7 @@ class NearbyPlaces:
         if not len(ties.rows):
             self._enter(row, NO_PLACES, np.zeros((dim, 0)), ties.joint[:dim, :dim])
             if not self._considered:
-                self.position[row] = self._moved(ties.place, np.zeros(dim))
+                self.position[row] = self._move_place(ties.place, np.zeros(dim))
             return
         there = np.flatnonzero(self._slot[ties.rows] >= 0)
         given, own = ties.rows[there], ties.joint[:dim, :dim]
@@ -283,7 +283,7 @@ class NearbyPlaces:
             self.covariance[np.ix_(slot, slot)] = own
         else:
             moved = self._apart(self.position[given], ties.neighbours[there])
-            self.position[row] = self._moved(ties.place, gain @ moved.ravel())
+            self.position[row] = self._move_place(ties.place, gain @ moved.ravel())
 
     def _enter(self, row: int, given: IntArray, gain: FloatArray, spread: FloatArray) -> None:
         """Put a place in a free slot."""

@@ -126,9 +126,11 @@ class StreamingSlam:
             self.work()
         if self._prior_map is not None and not self._align_classes:
             self._lay_over_map()
-        self.online_pose[row], self.online_covariance[row] = self._told(self._filter.pose, self._filter.covariance)
+        self.online_pose[row], self.online_covariance[row] = self._report_pose(
+            self._filter.pose, self._filter.covariance
+        )
 
-    def _told(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _report_pose(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A pose and its covariance in metres, of the robot's front, in the frame of the first one or of the map."""
         front = self._prior.front(self._filter.states, self._problem.mount)
         return told(pose, covariance, front, self._scale, self._align_classes)
@@ -143,7 +145,7 @@ class StreamingSlam:
         problem, states = self._problem, self._filter.states
         last_s, free = problem.stamp_s[self._n_poses - 1], problem.prior.free
         motion = PlanarMotion.over(drive, last_s, stamp_s, states, free, self._noise)
-        return self._told(*self._filter.ahead(motion))
+        return self._report_pose(*self._filter.ahead(motion))
 
     def places(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return (k, 2) where landmarks of the newest pose are, in the frame of `online_pose`, and (k, 2, 2)."""

@@ -221,7 +221,7 @@ def fit_likelihood(
         ConfigError: an unknown family.
         NumericalError: the likelihood has no clear maximum in this family.
     """
-    name, family = _named(kind)
+    name, family = _name_family(kind)
 
     def cost(parameters: FloatArray) -> float:
         try:
@@ -264,7 +264,7 @@ def fit_best(data: CensoredLifetimes, kinds: Sequence[str | Kind] = tuple(KINDS)
     return min(fits, key=lambda one: one.aic)
 
 
-def _named(kind: str | Kind) -> tuple[str, Kind]:
+def _name_family(kind: str | Kind) -> tuple[str, Kind]:
     if isinstance(kind, Kind):
         return "/".join(kind.names), kind
     if kind not in KINDS:

@@ -294,9 +294,9 @@ def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
     rows = [
         (
             f"<code>{escape(p.name)}</code>",
-            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit)) + _held(p) + _alone(p),
+            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit)) + _say_why_held(p) + _alone(p),
             escape(quantity(p.prior_mean, p.prior_sigma, p.unit)) if has_prior(p) else "–",
-            _learned(p),
+            _find_gain(p),
             escape(p.meaning),
         )
         for p in parameters
@@ -304,7 +304,7 @@ def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
     return table(("name", "estimate, 1σ", "prior, 1σ", "narrower", "meaning"), rows, numbers=(1, 2, 3))
 
 
-def _held(parameter: ParameterEstimate) -> str:
+def _say_why_held(parameter: ParameterEstimate) -> str:
     """Why a state was not estimated."""
     if not parameter.fixed:
         return ""
@@ -313,7 +313,7 @@ def _held(parameter: ParameterEstimate) -> str:
     return " <small>as stated</small>"
 
 
-def _learned(parameter: ParameterEstimate) -> str:
+def _find_gain(parameter: ParameterEstimate) -> str:
     """Return the ratio of the prior's to the estimate's standard deviation."""
     if not has_prior(parameter) or not 0 < parameter.sigma < math.inf:
         return "–"

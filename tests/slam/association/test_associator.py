@@ -165,7 +165,7 @@ def test_plane_and_space_share_all_but_what_depends_on_the_group() -> None:
     )
     assert planar & spatial == set(Associator.__abstractmethods__) | left
     shared = {name for name, value in vars(Associator).items() if inspect.isfunction(value)}
-    assert {"finish", "against", "_after_driving", "_match", "_use", "_merged"} <= shared - planar - spatial
+    assert {"finish", "against", "_after_driving", "_match", "_use", "_merge_duplicates"} <= shared - planar - spatial
     assert "step" not in spatial
     modules = [
         {name for name, value in vars(one).items() if getattr(value, "__module__", "") == one.__name__}
@@ -202,7 +202,7 @@ def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPat
     with monkeypatch.context() as no:
         no.setattr("evermap.slam.association.associator.find_most_rise", rejected)
         no.setattr("evermap.slam.association.in_plane._is_better", lambda *_: rejected() > 0.0)
-        assert associator._merged(solved) is solved
+        assert associator._merge_duplicates(solved) is solved
         assert len(trials) > 1
         count = len(trials)
         assert associator._correct_visits(twisted, set()) is twisted

@@ -89,7 +89,7 @@ def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray
     best = max((_list_agreeing(seen, known, some, every, np.zeros(3)) for some in windows), key=len, default=[])
     settings = known.settings
     if len(best) < settings.shared_pairs:
-        best = _searched(seen, known, windows, (1.0,) if metre else FACTORS)
+        best = _search_pairs(seen, known, windows, (1.0,) if metre else FACTORS)
         if len(best) < settings.found_pairs:
             return None
     mine, theirs = (np.array(part) for part in zip(*best, strict=True))
@@ -98,7 +98,7 @@ def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray
     return in_space(rigid(own[:, :2], known.position_m[theirs, :2]), own, known.position_m[theirs]), factor
 
 
-def _searched(
+def _search_pairs(
     seen: SeenBoxes, known: MapBoxes, windows: list[IntArray], factors: tuple[float, ...]
 ) -> list[tuple[int, int]]:
     """Pairs of boxes that are the same, by the constellation of some at a time; the largest such set."""

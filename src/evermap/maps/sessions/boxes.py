@@ -65,15 +65,15 @@ def localised(
     settings, taken = config.living, take_in_traffic(recording, config.slam.space, config.track)
     p_site = aged(living, settings, float(taken.recording.frames.stamp_s[0])).p_here
     solved, known = _by_itself(taken, progress, settings.boxes), MapBoxes.of(living, p_site, config)
-    found = _placed(taken, solved, living, known) if len(living.places) else None
+    found = _place_session(taken, solved, living, known) if len(living.places) else None
     if found is not None and found[1] != 1.0:
         taken = rescale(taken, found[1])
         solved = _by_itself(taken, None, settings.boxes)
-        found = _placed(taken, solved, living, known)
+        found = _place_session(taken, solved, living, known)
     held = None
     if found is not None:
         with suppress(NumericalError):  # what was held contradicts itself
-            held = _settle(taken, replace(solved, optimum=_moved(solved.optimum, found[0])), living, known)
+            held = _settle(taken, replace(solved, optimum=_move_session(solved.optimum, found[0])), living, known)
     if held is None or not _agrees(taken, *held, living, known):
         alone: SpatialVisit = _visit(taken, solved, _Matched.nothing(solved), living, config)
         return Localised.lost(alone, living, NOT_FOUND) if len(living.places) else Localised(alone, alone.named(living))
@@ -116,7 +116,7 @@ class _Matched:
 
 def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living: LivingMap, known: MapBoxes) -> bool:
     """Return whether a sufficient share of the static boxes matches the map, among those near boxes of the map."""
-    if len(_named(taken, held, living)[0]) > 1:
+    if len(_match_named(taken, held, living)[0]) > 1:
         return True
     settings = known.settings
     seen = list_boxes(taken, held, settings)
@@ -130,7 +130,7 @@ def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living
 def _by_itself(taken: TrafficIntake, progress: Progress | None, settings: BoxesConfig) -> SpatialSolved:
     """The session alone, in the frame of its odometry, with boxes put together that are one."""
     solved = solve_in_traffic(taken, progress)
-    solved = replace(solved, optimum=_moved(solved.optimum, _frame_of(taken.recording)))
+    solved = replace(solved, optimum=_move_session(solved.optimum, _frame_of(taken.recording)))
     return _together(taken, solved, np.arange(len(solved.identity)), settings)
 
 
@@ -142,7 +142,7 @@ def _frame_of(recording: SpatialRecording) -> FloatArray:
     return np.asarray(first if se3.rotation_of(first)[2, 2] > TILTED else se3.identity())
 
 
-def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
+def _move_session(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
     """Transform the session by a rigid motion (7,)."""
     estimate, oriented = optimum.estimate, optimum.smoother.problem.oriented
     place = se3.compose(motion, estimate.place)
@@ -199,7 +199,7 @@ def _same(seen: SeenBoxes, settings: BoxesConfig) -> tuple[IntArray, IntArray]:
     return one, other
 
 
-def _named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tuple[IntArray, IntArray]:
+def _match_named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tuple[IntArray, IntArray]:
     """Return rows of the problem's places with an identity, and of the matching places of the map."""
     identity = identities_of(taken.intake, solved)[0]
     members = living.members
@@ -210,11 +210,11 @@ def _named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tu
     return row[place >= 0], place[place >= 0]
 
 
-def _placed(
+def _place_session(
     taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes
 ) -> tuple[FloatArray, float] | None:
     """Return the motion (7,) from the session to the map, and the factor on its lengths; None if ambiguous."""
-    row, place = _named(taken, solved, living)
+    row, place = _match_named(taken, solved, living)
     own, there = solved.optimum.estimate.place[row, :3], living.places.position_m[place]
     if len(row) > 1:
         named = accept_alignment(Matches.of(own[:, :2], there[:, :2]), known.slam.localize, fewest=2)
@@ -234,7 +234,7 @@ def _settle(
     matched, most = _matched(taken, solved, living, known, np.zeros(0)), -1
     for _ in range(ROUNDS):
         held_m = solved.optimum.estimate.place[matched.place >= 0, :2]
-        held = _together(taken, _held(solved, living, matched, known.settings), _labels(matched), known.settings)
+        held = _together(taken, _hold_places(solved, living, matched, known.settings), _labels(matched), known.settings)
         following = _matched(taken, held, living, known, held_m)
         settled = np.array_equal(following.place, matched.place)
         solved, matched = held, following
@@ -255,7 +255,7 @@ def _labels(matched: _Matched) -> IntArray:
     return np.where(matched.place >= 0, count + matched.place, np.arange(count))
 
 
-def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings: BoxesConfig) -> SpatialSolved:
+def _hold_places(solved: SpatialSolved, living: LivingMap, matched: _Matched, settings: BoxesConfig) -> SpatialSolved:
     """Solve the session with its places constrained to their matches in the map."""
     optimum, row = solved.optimum, np.flatnonzero(matched.place >= 0)
     place = matched.place[row]
@@ -289,7 +289,7 @@ def _matched(
     settings = known.settings
     seen, count = list_boxes(taken, solved, settings), len(solved.identity)
     found = _Matched.nothing(solved)
-    row, place = _named(taken, solved, living)
+    row, place = _match_named(taken, solved, living)
     near = np.linalg.norm(solved.optimum.estimate.place[row, :3] - living.places.position_m[place], axis=1)
     found.place[row[near < settings.named_m]] = place[near < settings.named_m]
     loose_m = np.zeros(len(seen.place))

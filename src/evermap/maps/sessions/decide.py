@@ -51,7 +51,7 @@ def decided(
         settings: how much it takes.
     """
     session = _Session(before, entered, now, looks, arrivals, start_s, longest, settings)
-    told, hidden, shown = _told(before, entered), session.hidden, session.shown
+    told, hidden, shown = _find_current(before, entered), session.hidden, session.shown
     for row, clique in enumerate(session.cliques.tolist()):
         if session.missed[row] and not session.was_hit[row]:  # the more probably hidden, the more it stands there
             hidden[session.sight[row]] += looks.share[row] * (1.0 - session.p_away[row])
@@ -264,7 +264,7 @@ class _Session:
         if self.stands[row] and site == old:
             self._goes_on(row, stay)
         elif self.stands[row] and self.hits[site]:
-            self._moved(row, old, stay)
+            self._report_moved(row, old, stay)
         elif (
             not self.stands[row]
             and self.expected[old] >= self.settings.least_looks
@@ -333,7 +333,7 @@ class _Session:
         if self.hits[site]:
             self.p_kept[site] = sites.p_here[site]
 
-    def _moved(self, row: int, old: int, stay: int) -> None:
+    def _report_moved(self, row: int, old: int, stay: int) -> None:
         site = int(self.site[row])
         left_s = self._ends(old, stay, 1.0)
         since = self._begins(int(self.cliques[row]), site, left_s)
@@ -416,7 +416,7 @@ class _Session:
         self.found.append(change)
 
 
-def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
+def _find_current(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
     """Return rows of the site and of the stay (-1 for none) of every clique with a current stay."""
     told: dict[int, tuple[int, int]] = {}
     stays = after.stays

@@ -312,15 +312,15 @@ class _Assigned:
 
     def members(self) -> tuple[IntArray, Where | None]:
         """Return (K,) rows of the map's members, -1 for new ones; and where all lie, None if nothing matches."""
-        place, where = self._placed(self._alike & self._not_unlike()), None
+        place, where = self._place_certain(self._alike & self._not_unlike()), None
         if self._traits is not None and not np.any(place >= 0):  # all may be unlike, in another light
-            compared = self._compared(self._placed(self._alike))
-            place = self._placed(self._alike & compared._not_unlike())
+            compared = self._learn_columns(self._place_certain(self._alike))
+            place = self._place_certain(self._alike & compared._not_unlike())
         member = np.full(len(place), -1, dtype=np.int64)
         while np.any(place >= 0):
-            place = self._compared(place)._grown(place)
+            place = self._learn_columns(place)._grown(place)
             where = self._where(np.arange(len(place)), place)
-            member = self._compared(place)._assign_members(where, place)
+            member = self._learn_columns(place)._assign_members(where, place)
             more = self._regain_places(where, member, place)
             if np.array_equal(more, place):
                 break
@@ -410,7 +410,7 @@ class _Assigned:
         sure = found.pairs[found.margin >= math.log(p_merge / (1.0 - p_merge))]
         return group[k[sure]], m[sure]
 
-    def _compared(self, place: IntArray) -> Self:
+    def _learn_columns(self, place: IntArray) -> Self:
         """Return the same with how columns differ between the session and the map, learned from certain matches."""
         if self._traits is None:
             return self
@@ -419,7 +419,7 @@ class _Assigned:
         other._traits = self._traits.compared(held, member, self._settings.fewest_compared)
         return other
 
-    def _placed(self, allowed: BoolArray) -> IntArray:
+    def _place_certain(self, allowed: BoolArray) -> IntArray:
         """Return (K,) rows of the places that landmarks of one stretch certainly match, -1 for the others; of the
         `allowed` (K, P) pairs.
         """

@@ -339,7 +339,7 @@ def refitted(
     straightened = False
     if smoother.inlier_probability(estimate).mean() < (1.0 - settings.most_lost) * outcome.inlier.mean():
         # a blind stretch bent the session by more than a descent can take back: every stretch placed by itself
-        other = _solve_near(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
+        other = _solve_near(problem, noise, _place_poses(problem, start, held.row, settings), robust=robust)
         if other[0].cost(other[1]) < smoother.cost(estimate):
             solved, straightened = other, True
     in_map = divided(solved, prior, outcome.p_needed, outcome.noise, outcome.revision, aligned=True, averaged=False)
@@ -388,7 +388,7 @@ def _solve_near(
     return smoother, *exhaust(smoother.solve_in_slices(start, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN))
 
 
-def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfig) -> Estimate:
+def _place_poses(problem: Problem, start: Estimate, row: IntArray, settings: FitConfig) -> Estimate:
     """`start` with every pose where the sightings around it show the landmarks `row` (K,) of the map.
 
     Each pose is moved by the rigid motion that brings these sightings, as the poses nearby have them, onto the

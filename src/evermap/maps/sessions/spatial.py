@@ -388,7 +388,7 @@ def localise_in_space(
     where = _laid(visit, part, p_site, settings)
     if where is None or np.count_nonzero(where.place >= 0) < 2:
         return Localised.lost(visit, living, NOT_FOUND)
-    visit = replace(visit, solved=replace(visit.solved, optimum=_held(visit, part, where), from_map=None))
+    visit = replace(visit, solved=replace(visit.solved, optimum=_hold_places(visit, part, where), from_map=None))
     vicinity = None
     if large:
         vicinity, where = widened(living, part, named, where, visit.path_m, visit.floor_sensor, settings)
@@ -453,7 +453,7 @@ def _fuse_places(
     return position_m + (gain @ off).reshape(-1, 3), 0.5 * (covariance + covariance.T)
 
 
-def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum:
+def _hold_places(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum:
     """Solve the session once more, with matched landmarks constrained to their places in the map."""
     optimum = visit.optimum
     problem, places = optimum.smoother.problem, living.places

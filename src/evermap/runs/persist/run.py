@@ -272,7 +272,7 @@ def run_persist(
         clock.done("learn")
         beliefs, p_at_looks, forecasts, merged_mass = _filter(table, order, config, models, ordered)
     except NumericalError as error:
-        raise _named(error, table, order) from error
+        raise _name_error(error, table, order) from error
     except DataError as error:
         raise DataError(error.problem, path=table.source or None, hint=error.hint) from error
     clock.done("filter")
@@ -390,7 +390,7 @@ def _odd_looks(totals: Totals) -> list[str]:
     return told
 
 
-def _named(error: NumericalError, table: LookTable, order: IntArray) -> Exception:
+def _name_error(error: NumericalError, table: LookTable, order: IntArray) -> Exception:
     """Return the error of a model, which counts looks, with the feature's name and the line in the file."""
     if error.row is None:
         return error

@@ -123,7 +123,7 @@ def persist_in_parts(
     with TemporaryDirectory(prefix="parts-", dir=folder.path(".")) as name:
         scratch = Path(name)
         parted = PartedLooks.split(Path(path), scratch, config)
-        learned, with_model = _learned(folder, parted, config)
+        learned, with_model = _learn_models(folder, parted, config)
         quoted, numbered = needs_quotes(arrow_cells(list(parted.names))), are_numbers(parted.names)
         work = partial(
             _work_on, parted=parted.alone(), config=with_model, quoted=quoted, numbered=numbered, folder=scratch
@@ -135,7 +135,7 @@ def persist_in_parts(
                 raise one
         _join(folder, scratch, parted, config, quoted)
         totals = Totals.merged([part.totals for part in done])
-        shown = run_persist(parted.of(_shown(parted, done, totals, config)), with_model)
+        shown = run_persist(parted.of(_choose_shown(parted, done, totals, config)), with_model)
     told = tuple(remarks(config, shown.models, totals))
     result = replace(shown, config=config, learned=learned, totals=totals, warnings=told)
     return _finish(folder, result, clock, info or RunInfo(), {"parts_s": perf_counter() - start}, None)
@@ -168,7 +168,7 @@ def _work_on(
     return _Part(result.totals, changes.per_feature(table.n_features), latest)
 
 
-def _learned(
+def _learn_models(
     folder: RunFolder, parted: PartedLooks, config: PersistConfig
 ) -> tuple[LearnedModels | None, PersistConfig]:
     """Learn as from the table in one piece, and return settings that read what was learned."""
@@ -225,7 +225,7 @@ def _join_rows(path: Path, scratch: Path, parted: PartedLooks, quoted: bool) -> 
             file.write(csv_bytes(cells, quoted=quoted, header=start == 0))
 
 
-def _shown(parted: PartedLooks, done: Sequence[_Part], totals: Totals, config: PersistConfig) -> IntArray:
+def _choose_shown(parted: PartedLooks, done: Sequence[_Part], totals: Totals, config: PersistConfig) -> IntArray:
     """The features of which figures and report tell."""
     changes = np.concatenate([part.changes for part in done])
     changed = most_changed(changes, parted.looks, max(MOST_FEATURES, config.figures))

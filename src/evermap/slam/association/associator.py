@@ -183,13 +183,13 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         """
         refused: set[tuple[int, int]] = set()
         total = math.inf
-        solved = self._realign(self._correct_visits(self._merged(self._begun(begun)), refused))
+        solved = self._realign(self._correct_visits(self._merge_duplicates(self._begun(begun)), refused))
         for left in reversed(range(LAST_ROUNDS)):
             before = solved
             again = self._reassign(before)
             if self.has_own_noise and np.array_equal(again.landmark_row, before.landmark_row):
                 break
-            solved = self._correct_visits(self._merged(self._learned(again)), refused)
+            solved = self._correct_visits(self._merge_duplicates(self._learned(again)), refused)
             if _are_same(before, again, solved):
                 break
             if goal < math.inf:
@@ -223,7 +223,9 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         """Share of the detections so far that were ambiguous between landmarks in their frame."""
         return self._doubted / max(int(self._first[self._done]), 1)
 
-    def _merged(self, solved: SolvedT, recent: int | None = None, *, within: tuple[int, int] | None = None) -> SolvedT:
+    def _merge_duplicates(
+        self, solved: SolvedT, recent: int | None = None, *, within: tuple[int, int] | None = None
+    ) -> SolvedT:
         """Merge duplicates while there are any.
 
         Args:

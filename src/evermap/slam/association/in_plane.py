@@ -208,7 +208,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         begun = replace(now, estimate=replace(now.estimate, pose=pose()))
         again, first = self._solve_assignment(begun.split_visits()), 0
         while (later := again.assignment.n_landmarks - first) > 0:
-            again = self._merged(again, within=(first, later - RECENT))
+            again = self._merge_duplicates(again, within=(first, later - RECENT))
             first = again.assignment.n_landmarks - (later - RECENT)
         # each landmark not yet merged has two more parameters, a nat on average
         gained = solved.cost - again.cost - (again.assignment.n_landmarks - now.n_landmarks)
@@ -373,7 +373,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         """Solve the batch with the noise (M, 2) of detections, and merge duplicates of all landmarks or of those seen
         last.
         """
-        return self._merged(self._solve_assignment(_with_sigma(assignment, sigma)), recent)
+        return self._merge_duplicates(self._solve_assignment(_with_sigma(assignment, sigma)), recent)
 
     def _solve_merged(self, solved: PlanarSolution, pairs: list[tuple[int, int]]) -> PlanarSolution:
         return self._solve_assignment(solved.assignment.merged(pairs))
@@ -404,7 +404,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         every = overlays(part.source, part.target, part.allowed, density=solved.density_m2, settings=self._settings)
         least = self._total(self._real(solved)) - rules.constellation.certain_nats
         for overlay in every[:REALIGNED]:
-            trial = self._merged(self._solve_assignment(solved.assignment.merged(part.rows(overlay.pairs))))
+            trial = self._merge_duplicates(self._solve_assignment(solved.assignment.merged(part.rows(overlay.pairs))))
             fewer = max(0, solved.assignment.n_landmarks - trial.assignment.n_landmarks)
             against = self._total(self._real(trial)) + rules.landmark_nats * fewer
             if against < least:
@@ -424,7 +424,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
         rules = self._rules
 
         def split(parts: list[IntArray]) -> PlanarSolution | None:
-            trial = self._merged(self._solve_assignment(now.split(parts)))
+            trial = self._merge_duplicates(self._solve_assignment(now.split(parts)))
             return trial if _is_better(trial, solved) else None
 
         for _ in range(SPLIT_ROUNDS):
@@ -452,7 +452,7 @@ class PlanarAssociator(Associator[Assignment, Assignment, PlanarSolution, Planar
                 now, solved.marginals, trusted, density=solved.density_m2, probability=self._rules.p_merge
             )
             starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
-            trials = (self._merged(self._solve_assignment(start)) for start in starts)
+            trials = (self._merge_duplicates(self._solve_assignment(start)) for start in starts)
             better = next((trial for trial in trials if _is_better(trial, solved)), None)
             if better is None:
                 break

@@ -109,7 +109,7 @@ def propose_merges(
     sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen if known is None else seen & known)
     if len(sources) < 1 or len(targets) < 2:
         return []
-    pairs = np.vstack([_near(solution, sources, targets), _named(solution.kind, sources, targets)])
+    pairs = np.vstack([_near(solution, sources, targets), _list_named(solution.kind, sources, targets)])
     count = len(solution.place)
     not_tried = np.array([u * count + o for u, o in refused], dtype=np.int64)
     younger, older = np.divmod(np.setdiff1d(pairs[:, 0] * count + pairs[:, 1], not_tried), count)
@@ -213,7 +213,7 @@ def _without_contradictions(merges: list[tuple[int, int]], kind: IntArray) -> li
     return kept
 
 
-def _named(kind: IntArray, sources: IntArray, targets: IntArray) -> IntArray:
+def _list_named(kind: IntArray, sources: IntArray, targets: IntArray) -> IntArray:
     """Different pairs (younger, older) of a source and a target with the same name, at any distance."""
     row, column = np.nonzero(same_name(kind[sources][:, None], kind[targets][None]) & (sources[:, None] != targets))
     pairs = np.column_stack([sources[row], targets[column]])

@@ -144,7 +144,7 @@ def drawn(
         first, problem.reading, variance, assignment.kind, problem.stamp_s, traits.value, traits.errors, traits.spread,
         _Rules.of(settings),
     )  # fmt: skip
-    cloud = _begun(assignment.estimate.landmark, assignment.of_kind, like, int(count), settings)
+    cloud = _begin_particles(assignment.estimate.landmark, assignment.of_kind, like, int(count), settings)
     row, pose, evidence = _run(seen, _Sensor(seat_sensor(problem.mount, states), states), steps, noise, cloud, seed)
     met, row[row >= 0] = np.unique(row[row >= 0], return_inverse=True)
     estimate = Estimate(pose, np.zeros((len(met), 2)), states.copy())
@@ -163,11 +163,11 @@ def warm_up() -> None:
         np.arange(3), two, two, np.full((2, 2), UNKNOWN), np.arange(2.0), traits.value, traits.errors, traits.spread,
         _Rules.of(USUAL),
     )  # fmt: skip
-    cloud = _begun(one, np.full((1, 2), UNKNOWN), traits.nothing(1), 2, USUAL)
+    cloud = _begin_particles(one, np.full((1, 2), UNKNOWN), traits.nothing(1), 2, USUAL)
     _run(seen, _Sensor(np.zeros(3), np.zeros(N_STATES)), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), cloud, 0)
 
 
-def _begun(place: FloatArray, label: IntArray, like: Likeness, count: int, settings: SlamConfig) -> _Cloud:
+def _begin_particles(place: FloatArray, label: IntArray, like: Likeness, count: int, settings: SlamConfig) -> _Cloud:
     """Particles with a prior of landmarks (L, 2)."""
     bent, most = settings.association.particles.bent, settings.association.readings.most_readings
     n = len(place)

@@ -93,11 +93,11 @@ def most_probable(
     weight = np.exp(np.minimum(score, 500.0))
     share = weight / (1.0 + np.bincount(seen, weight, len(frame))[seen])
     order = np.lexsort((-score, frame[seen]))
-    return _given(seen[order], row[order], frame, share[order] > p_own, len(frame), n_landmarks)
+    return _assign_candidates(seen[order], row[order], frame, share[order] > p_own, len(frame), n_landmarks)
 
 
 @kernel
-def _given(
+def _assign_candidates(
     seen: IntArray, row: IntArray, pose_row: IntArray, sure: BoolArray, n_detections: int, n_landmarks: int
 ) -> IntArray:
     """(M,) landmark of every detection: candidates in order of frame and score, one per landmark and frame."""
@@ -198,7 +198,7 @@ def unseen_nats(assignment: Assignment) -> float:
     rules, measured, estimate = assignment.settings.association, assignment.measured, assignment.estimate
     look = _count_views(assignment)
     when = ((measured.stamp_s - measured.stamp_s[0]) // rules.forget_s).astype(np.int64)
-    expected = _expected(estimate.pose, estimate.landmark, look.edges, look.view, look.rate, when)
+    expected = _expect_sightings(estimate.pose, estimate.landmark, look.edges, look.view, look.rate, when)
     seen = np.zeros(expected.shape, dtype=np.bool_)
     seen[assignment.landmark_row[used], when[measured.pose_row[used]]] = True
     p_seen = -np.expm1(-expected)
@@ -259,7 +259,7 @@ def _looks(pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatAr
 
 
 @kernel
-def _expected(
+def _expect_sightings(
     pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatArray, rate: FloatArray, when: IntArray
 ) -> FloatArray:
     """(L, W) expected sightings of places, in the window `when` (N,) of each pose."""

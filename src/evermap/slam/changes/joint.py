@@ -152,7 +152,7 @@ class Joint(Method):
             if len(evidence.landmark) == 0:
                 return Explanation(problem, estimate, self._current())
             before = self.posterior
-            posterior, given = yield from self._weighed(evidence, given, len(bounds) - 1, thorough=final)
+            posterior, given = yield from self._weigh_worlds(evidence, given, len(bounds) - 1, thorough=final)
             told = without_common_motion(posterior.groups, evidence.landmark, given)
             groups = yield from self._all_timed(told, base, estimate, noise, evidence, bounds)
             if len(told) < len(posterior.groups):
@@ -249,7 +249,7 @@ class Joint(Method):
             )
         return tuple(rivals)
 
-    def _weighed(
+    def _weigh_worlds(
         self, evidence: WindowEvidence, given: GivenMap, n_windows: int, *, thorough: bool
     ) -> Slices[tuple[ChangePosterior, GivenMap]]:
         """The posterior, and the map with the landmarks that carry each other's identity at each other's place."""

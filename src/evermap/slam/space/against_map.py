@@ -120,7 +120,7 @@ def compared(
         sigma = accuracy.factor * stated
         if shared.any():  # else the factor follows from what stands, and settles with it
             found = judge(found, accuracy)
-        weight = _believed(found, sigma, problem.prior.weight)
+        weight = _weigh_places(found, sigma, problem.prior.weight)
         back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
         problem = replace(problem, prior=replace(problem.prior, sigma=sigma, weight=weight))
@@ -144,7 +144,7 @@ def has_contradictions(optimum: SpatialOptimum) -> bool:
     return bool((_judge_places(problem, _predict_places(optimum), problem.prior.sigma, shared).p_stands < 0.5).any())
 
 
-def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
+def _weigh_places(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
     """Return (K,) weights of the map's places: the farthest moved ones, which may distort others, go first."""
     spread = found.covariance + sigma[:, :, None] ** 2 * np.eye(6)
     far = np.einsum("ki,kij,kj->k", found.off, np.linalg.inv(spread), found.off)

@@ -84,9 +84,9 @@ def with_delays(optimum: SpatialOptimum) -> tuple[SpatialOptimum, Delays | None]
         if not asked.any():
             if not optimum.estimate.delay_s.any():
                 return optimum, found
-            return converge(problem, _moved(optimum, problem, asked), optimum.noise), found
+            return converge(problem, _move_values(optimum, problem, asked), optimum.noise), found
         try:
-            optimum = converge(free, _moved(optimum, free, asked), optimum.noise)
+            optimum = converge(free, _move_values(optimum, free, asked), optimum.noise)
         except NumericalError:  # what seemed to show a delay was jitter of the velocity
             return stated, found
         smoother, now = optimum.smoother, optimum.now
@@ -131,7 +131,7 @@ def _free_delays(
     return replace(problem, velocity_s=velocity_s, whole_s=whole_s, delay_sigma_s=sigma_s)
 
 
-def _moved(optimum: SpatialOptimum, problem: SpatialProblem, asked: BoolArray) -> SpatialEstimate:
+def _move_values(optimum: SpatialOptimum, problem: SpatialProblem, asked: BoolArray) -> SpatialEstimate:
     """Return the values, of a problem with other whole steps, at which the sensors were where they were."""
     estimate, of = optimum.estimate, optimum.smoother.sensor_of_pose
     row, state = np.arange(len(of)), estimate.state.copy()
@@ -143,7 +143,7 @@ def _moved(optimum: SpatialOptimum, problem: SpatialProblem, asked: BoolArray) -
 
 def _jitter(smoother: SpatialSmoother, now: SpatialLinear, variance: FloatArray, sigma_s: float) -> FloatArray:
     """Return (S,) what of the information on delays of variances (S,) is jitter of the velocity."""
-    real, changes = _shown(smoother.problem, smoother.driven(now), 0.0)
+    real, changes = _find_shown(smoother.problem, smoother.driven(now), 0.0)
     return np.maximum(1.0 / variance - sigma_s**-2, 0.0) * (1.0 - min(real / changes, 1.0))
 
 
@@ -159,7 +159,7 @@ def _price_delays(
     for row in np.flatnonzero(problem.delay_sigma_s):
         variance, worth = smoother.worth_by_stretches(now, STATES * int(row) + MOUNT)
         variance = 1.0 / (1.0 / variance - jitter[row])
-        real, changes = _shown(problem, smoother.driven(now), float(delay_s[row]))
+        real, changes = _find_shown(problem, smoother.driven(now), float(delay_s[row]))
         worth *= max(changes / real, 1.0)
         p_needed[row], information[row] = price(float(delay_s[row]), variance, worth, sigma_s)
         own = worth * variance * sigma_s**2 / (worth * variance + sigma_s**2)
@@ -172,11 +172,11 @@ def _find_averaging_time(problem: SpatialProblem, driven: FloatArray) -> float:
     assert problem.path is not None
     step_s = problem.path.step_s
     tried_s = step_s * 2.0 ** np.arange(max(1, int(np.log2(LONGEST_S / step_s)) + 1))
-    found = [_shown(replace(problem, velocity_s=float(each_s)), driven, 0.0) for each_s in tried_s]
+    found = [_find_shown(replace(problem, velocity_s=float(each_s)), driven, 0.0) for each_s in tried_s]
     return float(tried_s[int(np.argmax([real**2 / changes for real, changes in found]))])
 
 
-def _shown(problem: SpatialProblem, driven: FloatArray, delay_s: float) -> tuple[float, float]:
+def _find_shown(problem: SpatialProblem, driven: FloatArray, delay_s: float) -> tuple[float, float]:
     """Return the information on a delay that the changes of the velocity hold, without jitter and as they are.
 
     The former by their product with those of the velocity from one stamp of the odometry to the next but one.

@@ -130,7 +130,7 @@ def prepare_space(
     seen_in = frames_of_usable(recording, usable, fewest=fewest)
     frames = _find_frames(recording, seen_in, moving)
     pose_frame, path_s = frames.pose_frame, stamps[frames.row]
-    seen = connect(recording, usable, pose_frame, partial(_moved, recording.odometry))
+    seen = connect(recording, usable, pose_frame, partial(_find_motions, recording.odometry))
     used, landmark_id, place = seen.used, seen.landmark_id, seen.place
     some = rows_of(where, used)
     symmetries = _symmetries(recording, place, used, some.kind, len(landmark_id))
@@ -184,7 +184,7 @@ def prepare_space(
     )  # fmt: skip
 
 
-def _moved(odometry: SpatialOdometry | None, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
+def _find_motions(odometry: SpatialOdometry | None, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
     """Return (K, 7) motions by the odometry between instants (K,); none without odometry."""
     if odometry is None:
         return se3.identity(len(from_s))

@@ -199,7 +199,7 @@ class SpatialFilter(LocalFilter):
         found[turned] = se3.local(others[turned], places[turned])
         return found
 
-    def _moved(self, place: FloatArray, by: FloatArray) -> FloatArray:
+    def _move_place(self, place: FloatArray, by: FloatArray) -> FloatArray:
         """Return a place (7,) that differs from another by (6,)."""
         if np.isfinite(place[3]):
             return se3.retract(place, by)

@@ -581,7 +581,7 @@ def incremental(
         if len(met):
             where, alike = place[problem.place[met]], problem.symmetries[problem.place[met]]
             seen = partial(
-                _seen, either=either[:, met], place=where, log_share=log_share[:, met], sigma_m=sigma_m[met],
+                _price_sightings, either=either[:, met], place=where, log_share=log_share[:, met], sigma_m=sigma_m[met],
                 sigma_rad=sigma_rad[met], turned=turned[met], alike=alike,
             )  # fmt: skip
             # no candidate costs less than if it were where all is as seen
@@ -590,7 +590,7 @@ def incremental(
                 went_s = np.sqrt(unsure_s[row])
                 within = STILL_M + noise.translation * went_s, STILL_RAD + noise.rotation * went_s
                 candidate = _candidates(pose[row], ways[:, met], where, turned[met], alike)
-                cost = _moved(candidate, within) + seen(candidate).sum(axis=1)
+                cost = _price_motion(candidate, within) + seen(candidate).sum(axis=1)
                 cost[0] -= WORTH
                 best = int(np.argmin(cost))
                 pose[row] = candidate[best]
@@ -632,14 +632,14 @@ def _candidates(
     return np.vstack([predicted[None], by_places, by_all])
 
 
-def _moved(candidate: FloatArray, spread: tuple[float, float]) -> FloatArray:
+def _price_motion(candidate: FloatArray, spread: tuple[float, float]) -> FloatArray:
     """(C,) nats that it costs to be there rather than where the odometry says, the first."""
     off = se3.local(candidate[:1], candidate)
     squared = (off[:, :3] ** 2).sum(axis=1) / spread[0] ** 2 + (off[:, 3:] ** 2).sum(axis=1) / spread[1] ** 2
     return np.asarray(np.minimum(0.5 * squared, LOST))
 
 
-def _seen(
+def _price_sightings(
     candidate: FloatArray, either: FloatArray, place: FloatArray, log_share: FloatArray, sigma_m: FloatArray,
     sigma_rad: FloatArray, turned: BoolArray, alike: Symmetries,
 ) -> FloatArray:  # fmt: skip
