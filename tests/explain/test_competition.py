@@ -77,8 +77,18 @@ def named(result: SlamResult, code: str) -> Cause:
     return result.causes[0]
 
 
-@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
-@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize(
+    ("mapped", "kind"),
+    [
+        (False, "plane"),
+        (True, "plane"),
+        (True, "corners"),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in ((False, "corners"), (False, "poses"), (True, "poses"))
+        ),
+    ],
+)
 def test_nothing_is_asked_of_a_sound_drive(kind: str, mapped: bool) -> None:
     recording, survey = recorded(World(seed=1), kind)
     given = survey if mapped else None
@@ -191,8 +201,9 @@ def test_a_radio_that_moved_has_no_bias(shift_m: tuple[float, float]) -> None:
 @pytest.mark.parametrize(
     ("seed", "name", "shift_m", "again_s"),
     [
-        (5, 2, (-0.5, 0.6), 20.0),
-        (0, 6, (0.9, 0.0), 20.0),  # most ranges afterwards are outliers where it was
+        pytest.param(5, 2, (-0.5, 0.6), 20.0, marks=pytest.mark.slow),
+        # most ranges afterwards are outliers where it was
+        pytest.param(0, 6, (0.9, 0.0), 20.0, marks=pytest.mark.slow),
         (0, 11, (0.9, 0.0), 26.2),  # unseen for 12 s, with few ranges in the window of the second visit
         (4, 11, (0.0, -0.6), 20.0),  # and the first of them are as good for either place
     ],

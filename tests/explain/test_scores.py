@@ -69,8 +69,16 @@ def stamped_on_arrival(recording: Recording) -> Recording:
     return replace(recording, frames=replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s))
 
 
-@pytest.mark.parametrize("mapped", [False, True])
-@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+@pytest.mark.parametrize(
+    ("kind", "mapped"),
+    [
+        ("plane", False),
+        ("plane", True),
+        ("corners", False),
+        ("poses", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("corners", True), ("poses", False))),
+    ],
+)
 def test_nothing_is_suspected_of_a_sound_drive(kind: str, mapped: bool) -> None:
     world = World(seed=1)
     recording: Any = world.plane() if kind == "plane" else world.space(corners=kind == "corners")

@@ -142,6 +142,7 @@ def test_without_masks_nothing_changes(number: float) -> None:
     assert with_owned(parked, Config())[0] is parked
 
 
+@pytest.mark.slow
 def test_bodies_by_masks_are_worth_what_stated_ones_are() -> None:
     drive = simulate_yard(replace(DRIVING, walls_masked=True), 0)[0]
     stated = simulate_yard(replace(DRIVING, masked=None, stated=True), 0)[0]

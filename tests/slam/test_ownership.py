@@ -141,7 +141,7 @@ def test_a_wall_behind_a_parked_forklift_is_not_owned_once_it_drives_off() -> No
     assert find_links(sights([True] * 8 + [False] * 3, [0] * 8 + [1, 1, 2])).probability[0] < 0.1
 
 
-@pytest.mark.parametrize("config", [BOXED, UNSTATED], ids=["boxes", "motion"])
+@pytest.mark.parametrize("config", [pytest.param(BOXED, marks=pytest.mark.slow), UNSTATED], ids=["boxes", "motion"])
 def test_bodies_that_are_found_are_worth_what_stated_ones_are(config: YardConfig) -> None:
     drive = simulate_yard(config, 0)[0]
     stated = simulate_yard(replace(config, stated=True, boxed=False), 0)[0]

@@ -55,6 +55,7 @@ def test_the_loop_is_closed_behind_a_drift_of_metres():
     scored(recording, purity=0.99, completeness=0.97)
 
 
+@pytest.mark.slow
 def test_tags_are_told_apart_and_the_estimate_is_as_good():
     world = tagged_corridor(0, n_tags=16, drift=0.05)
     scored(world.recording, purity=1.0, completeness=1.0)
