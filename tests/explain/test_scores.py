@@ -97,7 +97,8 @@ WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, floa
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "lens")) for name in WRONG])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRONG)
 def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
     how, subject, value = WRONG[name]
     world = World(seed=1)

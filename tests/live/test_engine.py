@@ -501,7 +501,8 @@ print(sorted(compiled() - before))
 """
 
 
-@pytest.mark.parametrize("number", [pytest.param(0, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 2])
 def test_after_warm_up_no_step_waits_for_a_kernel(tmp_path: Path, two_sessions: Path, number: int) -> None:
     path = copied(two_sessions, tmp_path) if number else tmp_path / "new.evermap"
     code = WARM.format(here=str(Path(__file__).parent), path=str(path), number=number)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import evermap as em
@@ -182,7 +182,6 @@ def test_damage_of_a_covariance_is_told_where_it_is_read(tmp_path: Path) -> None
             loaded.covariance_m2.of(np.flatnonzero(loaded.covariance_m2.chunk == 0))
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**16))
 def test_shelves_are_the_table_that_is_on_them(seed: int) -> None:
     """Whatever comes and goes, against one table that is sorted again."""

@@ -156,6 +156,7 @@ def test_landmarks_without_a_name_keep_company_with_those_that_have_one() -> Non
     assert wrong <= 0.03 * again
 
 
+@pytest.mark.slow
 def test_a_large_map_that_shows_no_constellation_of_the_session_refuses_it() -> None:
     """The index has no motion to offer then; in a map of the same size that has its landmarks, the session is found."""
     recording = simulate_warehouse(WarehouseConfig(n_landmarks=40, rate_hz=1.0))
@@ -318,7 +319,8 @@ def described(
     return path, entered.session
 
 
-@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [0.0, 1.0])
 def test_exchanged_landmarks_are_recognised_by_what_they_are_like(
     lived: tuple[BuildingSimulation, list[Session]], described: tuple[Path, Session], shift: float, tmp_path: Path
 ) -> None:

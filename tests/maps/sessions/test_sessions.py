@@ -76,8 +76,8 @@ def test_changes_are_those_that_happened(seeds: Sequence[int]) -> None:
     Landmarks that the map takes for one body though they are several things are not counted as missed: it tells of the
     part that it saw, which is the whole for it.
 
-    Measured in four: 88 right, 2 wrong (one of them at .67), 6 missed (4 that came where nothing had been seen behind their
-    place until then, 2 that left and came back within a day) and 13 of several things that were taken for one.
+    Measured in four: 88 right, 2 wrong (one of them at .67), 6 missed (4 that came where nothing had been seen behind
+    their place until then, 2 that left and came back within a day) and 13 of several things that were taken for one.
     """
     right = wrong = missed = 0
     for world, sessions in map(live_through, seeds):

@@ -92,6 +92,7 @@ def solve(late_s: float, frame_s: float) -> tuple[SpatialRecording, SlamResult]:
     return recording, run_slam(recording, Config.model_validate({"slam": {"plane": False}}))
 
 
+@pytest.mark.slow
 def test_stops_hide_no_delay_in_space():
     """One jitter for the whole drive is enough: it is a median, and steps are as well known where the robot stands.
 

@@ -235,7 +235,8 @@ def test_what_was_moved_by_metres_draws_no_others_along(seed):
     assert not any("#2" in warning for warning in result.warnings)
 
 
-@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21, 22])
 def test_two_tags_that_were_carried_away_together_do_not_carry_the_robot_away(seed):
     """For some frames the robot sees nothing else, so that the two agree that it is where they had been."""
     world = tagged_corridor(seed)
