@@ -103,7 +103,7 @@ format: $(DEVELOPMENT)
 docs: $(RUNTIME) $(DOCUMENTATION)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
-# What the pages tell to type, the longest first; all else of tests/docs is in `make test`.
+# What the pages tell to type, the longest first, and the notebooks; all else of tests/docs is in `make test`.
 docs-check: $(DEVELOPMENT)
 	$(PYTEST:worksteal=load) --maxschedchunk 1 tests/docs -m slow
 

@@ -228,6 +228,7 @@ def test_a_session_is_compared_with_the_peer_without_its_marginals(report: Modul
     ]
 
 
+@pytest.mark.slow
 def test_a_history_is_read_and_grows_evenly(scale_maps: ModuleType) -> None:
     found = scale_maps.history(16)  # the file grows by pages: a quarter of these sessions averages over them
     assert {f"{name}_cpu_s" for name in ("log", "show", "diff", "why")} < found.keys()

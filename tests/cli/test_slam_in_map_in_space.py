@@ -110,6 +110,7 @@ def test_sessions_in_space_of_which_one_is_late(days: list[Path], tmp_path: Path
     np.testing.assert_allclose(ended, [86_400.0 + 0.5 * (N_FRAMES - 1)])  # there on the second day
 
 
+@pytest.mark.slow
 def test_a_replay_in_space_enters_what_slam_enters(days: list[Path], tmp_path: Path) -> None:
     live, site = tmp_path / "live.evermap", tmp_path / "slam.evermap"
     for day in days[:2]:

@@ -158,7 +158,9 @@ def test_pooled_hazards_tell_where_nothing_was_at_risk(tmp_path: Path) -> None:
     assert sum(high > 0.01 for _, _, high in curve) > 40
 
 
-@pytest.mark.parametrize("estimator", ["npmle", "exponential", "best", "gp", "pooled"])
+@pytest.mark.parametrize(
+    "estimator", ["npmle", "exponential", pytest.param("best", marks=pytest.mark.slow), "gp", "pooled"]
+)
 def test_what_truncation_leaves_unknown_is_told_by_every_estimator(estimator: str, tmp_path: Path) -> None:
     """Half live for hours, half for a month, and all are met at a day or later: no estimate knows of the hours."""
     rng, day = np.random.default_rng(4), 86400.0

@@ -64,6 +64,7 @@ def test_a_notebook_is_kept_without_outputs(notebook: Path) -> None:
     assert cells(notebook, "markdown")[0].startswith("# ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(notebook: Path, tmp_path: Path) -> None:
     code = script(notebook)

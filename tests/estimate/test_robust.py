@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.estimate.robust import weigh
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     squared=st.floats(0.0, 300.0),
     log_odds=st.one_of(st.floats(0.5, 50.0), st.just(7.0)),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import InputError, NumericalError
@@ -20,7 +20,6 @@ from evermap_studies.bateman2020.clique_range import nearest_per_clique, range_d
 from .cliques import PRIORS, Looks, looks, summed
 
 every_prior = pytest.mark.parametrize(("prior", "survival"), PRIORS.values(), ids=PRIORS)
-few = settings(max_examples=30, deadline=None)
 CLIQUES = 3
 
 
@@ -47,7 +46,6 @@ def assert_same(one: single.Belief, other: single.Belief, rtol: float = 1e-11) -
 
 
 @every_prior
-@few
 @given(seen=looks(cliques=CLIQUES), ahead=st.floats(0.0, 5.0))
 def test_a_clique_is_the_sum_over_all_times_of_its_death(
     prior: LifetimePrior, survival: Callable[[Any], Any], seen: Looks, ahead: float
@@ -62,7 +60,6 @@ def test_a_clique_is_the_sum_over_all_times_of_its_death(
 
 
 @every_prior
-@few
 @given(seen=looks(), ahead=st.floats(0.0, 5.0))
 def test_a_landmark_alone_is_the_sum_over_all_times_of_its_death(
     prior: LifetimePrior, survival: Callable[[Any], Any], seen: Looks, ahead: float
@@ -76,7 +73,6 @@ def test_a_landmark_alone_is_the_sum_over_all_times_of_its_death(
         assert state.log_evidence[k] == pytest.approx(evidence, rel=1e-10, abs=1e-12)
 
 
-@few
 @given(seen=looks())
 def test_cliques_of_one_are_landmarks_alone(seen: Looks) -> None:
     prior = PRIORS["general purpose"][0]
@@ -87,7 +83,6 @@ def test_cliques_of_one_are_landmarks_alone(seen: Looks) -> None:
     assert_same(state, landmarks_after(prior, seen))
 
 
-@few
 @given(seen=looks(cliques=CLIQUES), data=st.data())
 def test_the_order_of_landmarks_does_not_matter(seen: Looks, data: st.DataObject) -> None:
     order = np.array(data.draw(st.permutations(range(len(seen.clique)))), dtype=np.int64)
@@ -97,7 +92,6 @@ def test_the_order_of_landmarks_does_not_matter(seen: Looks, data: st.DataObject
     assert_same(cliques_after(prior, shuffled), cliques_after(prior, seen))
 
 
-@few
 @given(seen=looks(cliques=CLIQUES), seed=st.integers(0, 1000))
 def test_a_look_may_come_in_two_halves(seen: Looks, seed: int) -> None:
     """Some landmarks of an instant now, the others right after: what a clique's likelihood is a product of."""
@@ -125,7 +119,6 @@ def test_what_was_not_expected_is_neither_used_nor_checked() -> None:
     np.testing.assert_array_equal(alone.stamp_s, [0.0, 5.0, 0.0, 0.0])
 
 
-@few
 @given(seen=looks(cliques=1, landmarks=1, longest=12))
 @every_prior
 def test_observe_is_update(prior: LifetimePrior, survival: Callable[[Any], Any], seen: Looks) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.existence import single
@@ -14,7 +14,6 @@ from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Uniform
 from .priors import PRIORS, Stream, streams
 
 every_prior = pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
-few = settings(max_examples=40)
 
 
 def filtered(prior: LifetimePrior, stream: Stream) -> tuple[single.Belief, np.ndarray]:
@@ -36,7 +35,6 @@ def summed(prior: LifetimePrior, stream: Stream, query: float) -> tuple[float, f
 
 
 @every_prior
-@few
 @given(stream=streams(), ahead=st.floats(0.0, 0.9))
 def test_the_filter_is_the_sum_over_all_times_of_death(prior: LifetimePrior, stream: Stream, ahead: float) -> None:
     query = float(stream.time[-1]) + ahead
@@ -48,7 +46,6 @@ def test_the_filter_is_the_sum_over_all_times_of_death(prior: LifetimePrior, str
 
 
 @every_prior
-@few
 @given(stream=streams(), split=st.integers(0, 12))
 def test_splits_and_roads_do_not_matter(prior: LifetimePrior, stream: Stream, split: int) -> None:
     """A stream in one call, in two calls, look by look in a batch, and through the class for one feature."""
@@ -70,7 +67,6 @@ def test_splits_and_roads_do_not_matter(prior: LifetimePrior, stream: Stream, sp
     assert feature.predict(ahead) == pytest.approx(looks.predict(ahead)[0], rel=1e-10)
 
 
-@few
 @given(stream=streams(), scale=st.floats(1e-6, 1e6))
 @pytest.mark.parametrize(
     "make",
@@ -99,7 +95,6 @@ class Later:
         return self.prior.log_conditional_death(self.age + np.asarray(a), self.age + np.asarray(b))
 
 
-@few
 @given(stream=streams(), age=st.floats(0.125, 500.0))
 @pytest.mark.parametrize("prior", [PRIORS["exponential"], PRIORS["general purpose"], PRIORS["weibull"]])
 def test_a_feature_known_to_be_there_starts_anew(prior: LifetimePrior, stream: Stream, age: float) -> None:
@@ -115,14 +110,12 @@ def test_a_feature_known_to_be_there_starts_anew(prior: LifetimePrior, stream: S
 
 
 @every_prior
-@few
 @given(stream=streams())
 def test_a_detector_that_answers_at_random_says_nothing(prior: LifetimePrior, stream: Stream) -> None:
     blind = Stream(stream.time, stream.detected, 1.0 - stream.p_false, stream.p_false)
     np.testing.assert_allclose(filtered(prior, blind)[1], np.exp(prior.log_survival(stream.time)), rtol=1e-9)
 
 
-@few
 @given(data=st.data())
 def test_grouping_order_and_permutation_of_features(data: st.DataObject) -> None:
     """A shuffled stream over features of different priors is each feature's own stream."""

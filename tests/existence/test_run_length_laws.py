@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.existence.one_stay import PersistenceFilter
@@ -249,7 +249,6 @@ def test_other_features_do_not_matter(name: str) -> None:
     np.testing.assert_array_equal(again.p_present, track.p_present[rows])
 
 
-@settings(max_examples=40)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([Exponential(0.1), LogNormal(2.0, 0.02), Weibull(5.0, 8.0), Gamma(0.2, 50.0), never_leaves()]),

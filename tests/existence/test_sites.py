@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.special import betaln
@@ -419,7 +419,6 @@ def _worlds(draw: st.DrawFn) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
 @given(_worlds(), st.integers(0, 1000))
 def test_laws(world: dict[str, Any], which: int) -> None:
     found = follow_sites(**world)

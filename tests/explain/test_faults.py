@@ -62,8 +62,15 @@ def worst_m(recording: AnyRecording, result: SlamResult) -> float:
     return float(np.linalg.norm(off[0] - off[1] @ left @ right, axis=1).max())
 
 
-@pytest.mark.parametrize("make", [in_plane, in_space])
-@pytest.mark.parametrize("wrong", [standing, without_rows])
+@pytest.mark.parametrize(
+    ("wrong", "make"),
+    [
+        (standing, in_plane),
+        (without_rows, in_plane),
+        (standing, in_space),
+        pytest.param(without_rows, in_space, marks=pytest.mark.slow),
+    ],
+)
 def test_a_silent_odometry_is_bridged_and_told(make: Any, wrong: Any) -> None:
     recording = wrong(make())
     (found,) = find_silences(recording, USUAL)
@@ -192,8 +199,10 @@ def rename(recording: Any, names: dict[int, int], until_s: float = np.inf) -> An
     return replace(recording, detections=replace(seen, landmark_id=own))
 
 
-@pytest.mark.parametrize("make", [in_plane, in_space])
-@pytest.mark.parametrize("in_map", [False, True])
+@pytest.mark.parametrize(
+    ("in_map", "make"),
+    [(False, in_plane), (True, in_plane), (False, in_space), pytest.param(True, in_space, marks=pytest.mark.slow)],
+)
 def test_an_identity_on_two_landmarks_is_named(make: Any, in_map: bool) -> None:
     """At both ends of the field, which the robot passes in turns: 12 m are between them."""
     recording, world = make(), World(seed=4)
@@ -212,7 +221,7 @@ def test_an_identity_on_two_landmarks_is_named(make: Any, in_map: bool) -> None:
     assert not result.changes or {change.landmark_ids for change in result.changes} == {(14,)}
 
 
-@pytest.mark.parametrize("make", [in_plane, in_space])
+@pytest.mark.parametrize("make", [in_plane, pytest.param(in_space, marks=pytest.mark.slow)])
 def test_an_identity_that_is_read_elsewhere_is_not_on_two_landmarks(make: Any) -> None:
     """One that another landmark carries, for a while: that one is read wrongly; and one that was carried off once."""
     recording = make()

@@ -27,8 +27,18 @@ def make(kind: str, **more: Any) -> Any:
     return world.plane() if kind == "plane" else world.space(corners=kind == "corners")
 
 
-@pytest.mark.parametrize("in_map", [False, True])
-@pytest.mark.parametrize("kind", ["plane", pytest.param("corners", marks=pytest.mark.slow), "poses"])
+@pytest.mark.parametrize(
+    ("kind", "in_map"),
+    [
+        ("plane", False),
+        ("plane", True),
+        ("poses", False),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in (("poses", True), ("corners", False), ("corners", True))
+        ),
+    ],
+)
 def test_stamps_of_arrival_are_named_and_such_a_run_enters_no_map(kind: str, in_map: bool) -> None:
     given = make(kind)
     wrong = stamp_on_arrival(given, 0.08)

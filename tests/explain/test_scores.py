@@ -69,8 +69,16 @@ def stamped_on_arrival(recording: Recording) -> Recording:
     return replace(recording, frames=replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s))
 
 
-@pytest.mark.parametrize("mapped", [False, True])
-@pytest.mark.parametrize("kind", ["plane", "corners", "poses"])
+@pytest.mark.parametrize(
+    ("kind", "mapped"),
+    [
+        ("plane", False),
+        ("plane", True),
+        ("corners", False),
+        ("poses", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("corners", True), ("poses", False))),
+    ],
+)
 def test_nothing_is_suspected_of_a_sound_drive(kind: str, mapped: bool) -> None:
     world = World(seed=1)
     recording: Any = world.plane() if kind == "plane" else world.space(corners=kind == "corners")
@@ -89,7 +97,8 @@ WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, floa
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "lens")) for name in WRONG])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRONG)
 def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
     how, subject, value = WRONG[name]
     world = World(seed=1)
@@ -336,14 +345,17 @@ def test_stamps_of_arrival_alternate() -> None:
         assert scored(stamped_on_arrival(recording), given).alternation > 2.5
 
 
-def test_runs_are_asked_what_they_held() -> None:
+@pytest.mark.parametrize(
+    ("off_m", "kind"),
+    [(0.05, VerdictKind.SENSOR_SUSPECT), pytest.param(0.0, VerdictKind.SOUND, marks=pytest.mark.slow)],
+)
+def test_runs_are_asked_what_they_held(off_m: float, kind: VerdictKind) -> None:
     world = World(seed=1)
-    right, wrong = world.space(), mounts(world.space(), lambda at: at + [0.05, 0, 0, 0, 0, 0, 0])
-    for recording, kind in ((right, VerdictKind.SOUND), (wrong, VerdictKind.SENSOR_SUSPECT)):
-        verdict = run_slam(recording, prior_map=world.map_in_space()).verdict
-        assert verdict is not None
-        assert verdict.kind is kind, verdict.message
-        assert ("mounts of all sensors are -0.0" in verdict.message) is (recording is wrong)
+    recording = mounts(world.space(), lambda at: at + [off_m, 0, 0, 0, 0, 0, 0])
+    verdict = run_slam(recording, prior_map=world.map_in_space()).verdict
+    assert verdict is not None
+    assert verdict.kind is kind, verdict.message
+    assert ("mounts of all sensors are -0.0" in verdict.message) is (off_m > 0.0)
 
 
 def only_directions(recording: SpatialRecording, of_sensor: int | None = None) -> SpatialRecording:

@@ -26,9 +26,7 @@ from evermap.types import Landmarks
 from evermap.valid import validate
 
 Files = dict[str, bytes]
-damage_settings = settings(
-    max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
+damage_settings = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 INTERESTING = [
     b"\n",
     b"\r",
@@ -133,7 +131,7 @@ def test_damaged_zip(data: st.DataObject, mrclam: dict[str, str], tmp_path: Path
     sound_or_one_line(lambda: read_recording(path), check_recording)
 
 
-@settings(damage_settings, max_examples=40)
+@damage_settings
 @given(data=st.data())
 def test_damaged_parquet(
     data: st.DataObject, native: dict[str, str], lay_out: Callable, tmp_path: Path, check_recording: Callable

@@ -50,7 +50,7 @@ def test_maps_read_back_the_same(name: str, tmp_path: Path, assert_same: Callabl
 
 
 @pytest.mark.parametrize("name", WRITERS)
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_map_reads_back_the_same(name: str, data: st.DataObject, tmp_path: Path, assert_same: Callable) -> None:
     count = data.draw(st.integers(0, 5))

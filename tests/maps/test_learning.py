@@ -288,7 +288,7 @@ def test_a_handful_of_doubtful_ends_does_not_move_lifetimes() -> None:
     assert certain[-1] < before[-1] - 0.05
 
 
-@pytest.mark.parametrize(("kind", "age"), [(0, 2), (1, 0)])
+@pytest.mark.parametrize(("kind", "age"), [pytest.param(0, 2, marks=pytest.mark.slow), (1, 0)])
 def test_lifetimes_are_the_shorter_the_more_ends_are_believed(kind: int, age: int) -> None:
     """At ages up to which the ends were, and at which the class has not nearly all left, nor all stayed."""
     stays = seen_in_four_weeks(3)

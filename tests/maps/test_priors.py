@@ -209,7 +209,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("priors")
     priors = ["--prior", "pallet=weibull:scale=3d,shape=1.5", "--prior", "unknown:1d..1y"]
-    config = BuildingConfig(days=2, patrol_s=60.0, length_m=14.0, depth_m=13.0, rooms_per_side=1,
+    config = BuildingConfig(days=2, patrol_s=30.0, length_m=14.0, depth_m=13.0, rooms_per_side=1,
                             sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0))  # fmt: skip
     for day, recording in enumerate(simulate_building(config, seed=4).sessions):
         write_native(recording, folder / f"day{day}")

@@ -112,8 +112,9 @@ def test_killed_at_every_statement_of_a_commit(tmp_path: Path) -> None:
     assert check_all(path) == 1
 
 
-def test_killed_at_random_instants(tmp_path: Path) -> None:
-    """Thirty times while it commits as fast as it can: nothing is lost that was there, nothing is there by half."""
+@pytest.mark.parametrize("times", [8, pytest.param(30, marks=pytest.mark.slow)])
+def test_killed_at_random_instants(tmp_path: Path, times: int) -> None:
+    """Many times while it commits as fast as it can: nothing is lost that was there, nothing is there by half."""
     path = tmp_path / "m.evermap"
     random = np.random.default_rng(5)
     heard, told = os.pipe()
@@ -125,7 +126,7 @@ def test_killed_at_random_instants(tmp_path: Path) -> None:
                 os.write(told, b".")
 
     head = 0
-    for _ in range(30):
+    for _ in range(times):
         assert killed(work, heard, after_s=float(random.uniform(0.0, 0.04)))
         more = len(os.read(heard, 1000)) if select.select([heard], [], [], 0)[0] else 0
         with open_store(path) as store:

@@ -236,7 +236,6 @@ def test_learned_rates_are_those_that_its_own_looks_are_judged_by() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), sensor=st.sampled_from([AHEAD, ROUND]), share=st.floats(0.0, 1.0))
-@settings(max_examples=40, deadline=None)
 def test_looks_are_what_is_in_view_and_what_is_detected(seed: int, sensor: Sensor, share: float) -> None:
     rng = np.random.default_rng(seed)
     pose = np.column_stack([rng.uniform(-4.0, 4.0, (11, 2)), rng.uniform(-9.0, 9.0, 11)])

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import betabinom
 
@@ -87,7 +87,6 @@ def test_places_out_of_reach_are_refused(sensor: tuple[float, float], place: tup
         SightLines.empty().cells(*pairs)
 
 
-@settings(max_examples=50, deadline=None)
 @given(seeds, st.floats(-900.0, 900.0), st.floats(-900.0, 900.0))
 def test_a_map_that_is_shifted_as_a_whole_keeps_its_lines(seed: int, x_m: float, y_m: float) -> None:
     rng = np.random.default_rng(seed)
@@ -101,7 +100,6 @@ def test_a_map_that_is_shifted_as_a_whole_keeps_its_lines(seed: int, x_m: float,
     assert counts(tables[0]) == counts(tables[1])
 
 
-@settings(max_examples=50, deadline=None)
 @given(seeds, st.integers(0, 60), st.integers(0, 60))
 def test_halves_one_after_the_other_are_the_whole_and_all_is_counted(seed: int, before: int, after: int) -> None:
     rng = np.random.default_rng(seed)
@@ -124,7 +122,6 @@ def test_halves_one_after_the_other_are_the_whole_and_all_is_counted(seed: int, 
             assert told == pytest.approx((hits[line], looks[line]), rel=1e-9, abs=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
 @given(seeds, st.integers(1, 60))
 def test_the_order_of_looks_and_of_lines_does_not_matter(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
@@ -142,7 +139,6 @@ def test_the_order_of_looks_and_of_lines_does_not_matter(seed: int, n: int) -> N
     np.testing.assert_allclose(mixed.p_detect, lines.p_detect[order])
 
 
-@settings(max_examples=50, deadline=None)
 @given(seeds, st.integers(1, 60))
 def test_names_of_sites_mean_nothing_and_lines_to_what_is_no_more_are_left_out(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
@@ -169,7 +165,6 @@ def test_old_looks_fade() -> None:
     assert lines.p_detect[0] < 0.05
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(0, 30), st.floats(0.2, 0.95))
 def test_lines_are_what_the_beta_binomial_says(seed: int, n: int, nominal: float) -> None:
     """Counts of a line and of the eight around it, each look a whole one; the kinds' rates as they were learned."""
@@ -214,7 +209,6 @@ def test_a_single_line_is_as_scipy_has_it(hits: int, looks: int) -> None:
     assert p_clear[0] == pytest.approx(share * of_kind[0] / (share * of_kind[0] + (1.0 - share) * of_kind[1]), rel=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(0, 40), st.floats(0.05, 0.99))
 def test_a_line_along_and_around_which_nothing_was_seen_is_never_known_to_be_clear(
     seed: int, n: int, nominal: float
@@ -268,7 +262,6 @@ def test_nominal_lines_do_not_learn() -> None:
     np.testing.assert_allclose((lines.hits + 100) / (lines.hits + lines.misses + 1000), [0.7, 0.2], rtol=1e-4)
 
 
-@settings(max_examples=30, deadline=None)
 @given(seeds, st.integers(1, 12))
 def test_how_often_places_are_hidden_is_a_beta_mean_of_what_was_counted(seed: int, sessions: int) -> None:
     rng = np.random.default_rng(seed)
@@ -336,7 +329,6 @@ def test_how_often_places_are_hidden_fades() -> None:
     assert (table.p_hidden < 0.02).all()
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(1, 4))
 def test_views_are_the_last_session_of_each_cell_and_heading(seed: int, sessions: int) -> None:
     """Against a dictionary."""

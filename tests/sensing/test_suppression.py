@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError, InputError
@@ -17,7 +17,6 @@ from evermap_studies.bateman2020.suppression import suppressed
 LIMITS = {"observed_m": 6.0, "range_max_m": 16.0, "share": 0.25}
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(0, 25),
@@ -51,7 +50,6 @@ def test_nothing_is_left_out_at_a_share_of_zero() -> None:
     assert not suppressed(np.full(3, 10.0), nothing, ~nothing, clique, 1, **{**LIMITS, "share": 0.0})[0]
 
 
-@settings(max_examples=40, deadline=None)
 @given(ranges=st.lists(st.tuples(st.floats(0.0, 50.0), st.integers(0, 3)), max_size=20))
 def test_the_nearest_landmark(ranges: list[tuple[float, int]]) -> None:
     range_m = np.array([r for r, _ in ranges])

@@ -40,7 +40,7 @@ ODD = st.one_of(
 )
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def fuzzed(fleet: Fleet, asked: list[tuple[str, str, dict[str, Any]]], data: st.DataObject) -> None:
     method, path, operation = data.draw(st.sampled_from(asked))

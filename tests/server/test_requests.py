@@ -10,9 +10,10 @@ pytest.importorskip("schemathesis", reason="needs schemathesis: pip install 'eve
 from benchmarks.http_fuzz import fuzz, served
 
 
-def test_random_requests_are_answered_or_refused() -> None:
+@pytest.mark.parametrize("count", [30, pytest.param(100, marks=pytest.mark.slow)])
+def test_random_requests_are_answered_or_refused(count: int) -> None:
     with served(sessions=1) as (app, tokens):
-        found = fuzz(app, tokens, 100, 7, each=2)
+        found = fuzz(app, tokens, count, 7, each=2)
     assert found.defects == []
-    assert found.n_requests >= 100
+    assert found.n_requests >= count
     assert {200, 401, 403, 404, 422} <= {status for _, status in found.status}

@@ -159,6 +159,7 @@ def test_a_bag_of_several_files_is_read_by_its_metadata(bags: dict[str, Path]) -
     assert len(found.detections) == len(read_bag(folder).detections)
 
 
+@pytest.mark.parametrize("where", ["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)], indirect=True)
 def test_a_bag_is_uploaded_with_the_settings_of_its_robot(fleet: Fleet, bags: dict[str, Path]) -> None:
     data = bags["tags"].read_bytes()
     alone = fleet.upload(data).json()["id"]

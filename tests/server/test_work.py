@@ -58,20 +58,20 @@ def work(where: str, *more: str) -> subprocess.Popen[bytes]:
 @pytest.fixture(scope="module")
 def in_order(zips: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
     with open_store(tmp_path_factory.mktemp("order") / "m.evermap", create=True) as store:
-        for data in zips[:4]:
+        for data in zips[:3]:
             entered = enter_session(store, recording_of(data, check_digest(data, UploadLimits())))
             entered.commit(store)
         return store.load()
 
 
 def test_two_workers_lose_nothing_in_any_order(fleet: Fleet, zips: list[bytes], in_order: LivingMap) -> None:
-    for number in (2, 0, 3, 1, 2, 0):
+    for number in (2, 0, 1, 2, 0):
         assert fleet.upload(zips[number]).status_code in (200, 202)
     workers = [work(fleet.where) for _ in range(2)]
     assert [worker.wait(timeout=300) for worker in workers] == [0, 0]
     jobs = fleet("GET", "/jobs").json()
-    assert [job["state"] for job in jobs] == [JobState.ENTERED] * 4
-    assert sorted(job["revision"] for job in jobs) == [1, 2, 3, 4]
+    assert [job["state"] for job in jobs] == [JobState.ENTERED] * 3
+    assert sorted(job["revision"] for job in jobs) == [1, 2, 3]
     with fleet.server.sites.store("ward") as store:
         assert_same(store.load(), in_order)
 

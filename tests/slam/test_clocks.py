@@ -42,7 +42,8 @@ def test_sensors_of_several_clocks_are_estimated_in_space(seed: int, late_s: flo
         # what is late errs for long: the odometry was held for exact, .105 m, NEES 27, sound
         pytest.param(1, 0.15, True, marks=pytest.mark.slow),
         pytest.param(1, 0.4, True, marks=pytest.mark.slow),  # the same
-        (3, 0.15, True),  # a delay that was held seemed to be all jitter, and both were given up: .149 m
+        # a delay that was held seemed to be all jitter, and both were given up: .149 m
+        pytest.param(3, 0.15, True, marks=pytest.mark.slow),
     ],
 )
 def test_a_late_camera_of_two_is_named_and_poses_are_right(seed: int, late_s: float, in_map: bool) -> None:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from problems import (
     default_prior,
@@ -36,8 +36,6 @@ from evermap.slam.problem import USUAL, Drive
 ONCE = FLOOR_VARIANCE * np.eye(3)
 """What every window has, however short."""
 
-few = settings(max_examples=60)
-"""The first example waits for the compiler."""
 
 lengths = st.floats(-20.0, 20.0)
 angles = st.floats(-np.pi, np.pi)
@@ -96,7 +94,6 @@ def away_from_corners(pose, landmark, mount, reading):
     assume(abs(abs(se2.wrap(reading - bearing)) - np.pi) > 0.3)
 
 
-@few
 @given(poses, points, states, mounts, st.floats(0.1, 20.0), angles)
 def test_detection_is_the_range_law(pose, landmark, states, mount, range_m, bearing_rad):
     away_from_corners(pose, landmark, mount, bearing_rad)
@@ -106,7 +103,6 @@ def test_detection_is_the_range_law(pose, landmark, states, mount, range_m, bear
     assert e[1] == pytest.approx(se2.wrap(expected[1]), abs=1e-10)
 
 
-@few
 @given(poses, points, states, mounts, angles)
 def test_detection_derivatives(pose, landmark, states, mount, bearing_rad):
     away_from_corners(pose, landmark, mount, bearing_rad)
@@ -135,7 +131,6 @@ def odometry(pose, following, increment):
     return e, j1, j2
 
 
-@few
 @given(poses, poses, poses)
 def test_odometry_residual_is_gtsams_and_its_derivatives_too(pose, following, increment):
     e, j1, j2 = odometry(pose, following, increment)
@@ -150,7 +145,6 @@ def test_odometry_residual_is_gtsams_and_its_derivatives_too(pose, following, in
     assert j2 == pytest.approx(by_following, rel=1e-5, abs=1e-6)
 
 
-@few
 @given(poses, poses)
 def test_odometry_residual_by_the_increment_is_minus_identity_where_it_is_small(pose, increment):
     following = se2.compose(pose, increment)
@@ -158,7 +152,6 @@ def test_odometry_residual_by_the_increment_is_minus_identity_where_it_is_small(
     assert by_increment == pytest.approx(-np.eye(3), abs=1e-6)
 
 
-@few
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-3, 2.5))
 def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, passed):
     out = integrated(drive, start, start + passed, states)
@@ -166,7 +159,6 @@ def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, pas
     assert out.increment == pytest.approx(expected, abs=1e-9)
 
 
-@few
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-2, 2.5))
 def test_increment_derivatives(drive, states, start, passed):
     """By delay, forward scale, turn scale and slip, as right perturbations of the increment."""
@@ -182,7 +174,6 @@ def test_increment_derivatives(drive, states, start, passed):
     assert out.jacobian == pytest.approx(central(perturbation, states[7:]), rel=1e-4, abs=1e-6)
 
 
-@few
 @given(drives(), states, st.floats(-0.5, 1.0), st.floats(1e-2, 1.5), st.floats(0.05, 0.95))
 def test_two_adjacent_windows_make_the_whole(drive, states, start, passed, share):
     middle, stop = start + share * passed, start + passed
@@ -321,7 +312,6 @@ def test_silence_makes_the_covariance_grow_with_its_length():
     assert eigenvalues.min() > 0
 
 
-@few
 @given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6), st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
 def test_inverse_of_three_by_three_is_numpys(below, log_scale):
     root = np.zeros((3, 3))

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from groups import PLANE_CASE, SPACE_CASE, central
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from evermap.geometry import se2, se3
@@ -19,9 +19,6 @@ from evermap.slam.kernels3d import (
     pose_residual,
     retract,
 )
-
-few = settings(max_examples=60)
-"""The first example waits for the compiler."""
 
 LENGTH = 20.0
 turns = st.one_of(st.sampled_from([0.0, 1e-300, 1e-9, 1e-4, 0.22, 0.23, np.pi]), st.floats(-3.1, 3.1))
@@ -49,7 +46,6 @@ def by(function, pose):
     return central(lambda xi: function(se3.retract(pose, xi)), np.zeros(6))
 
 
-@few
 @given(poses, poses, residuals)
 def test_odometry_is_gtsams_factor_and_its_derivatives_are_differences(pose, increment, residual):
     following = se3.compose(pose, se3.compose(increment, se3.exp(residual)))
@@ -65,7 +61,6 @@ def test_odometry_is_gtsams_factor_and_its_derivatives_are_differences(pose, inc
     assert j2 == pytest.approx(by(lambda at: odometry(pose, at, increment)[0], following), rel=1e-5, abs=1e-5)
 
 
-@few
 @given(poses, poses, SPACE_CASE.twists(st.floats(0.05, 3.0), 5.0))
 def test_derivatives_of_odometry_are_gtsams(pose, increment, residual):
     following = se3.compose(pose, se3.compose(increment, se3.exp(residual)))
@@ -80,7 +75,6 @@ def test_derivatives_of_odometry_are_gtsams(pose, increment, residual):
     assert found[1] == pytest.approx(se3.right_jacobian_inverse(e), abs=1e-10)
 
 
-@few
 @given(poses, poses)
 def test_without_error_odometry_has_no_residual_and_the_derivatives_of_a_chain(pose, increment):
     e, j1, j2 = odometry(pose, se3.compose(pose, increment), increment)
@@ -96,7 +90,6 @@ def point_seen(pose, landmark, mount, measured):
     return called(point_residual, (pose, landmark, mount, measured), 3, (3, 6), (3, 3), (3, 6))
 
 
-@few
 @given(poses, points, poses, points)
 def test_points_are_gtsams_and_derivatives_are_differences(pose, landmark, mount, measured):
     e, j_pose, j_landmark, j_mount = point_seen(pose, landmark, mount, measured)
@@ -115,7 +108,6 @@ def pose_seen(pose, landmark, mount, measured):
     return called(pose_residual, (pose, landmark, mount, measured), 6, (6, 6), (6, 6), (6, 6))
 
 
-@few
 @given(poses, poses, poses, points, SPACE_CASE.twists(small_turns))
 def test_poses_of_landmarks_are_gtsams_and_derivatives_are_differences(pose, landmark, mount, position, turn):
     """The measured orientation is the predicted one, turned about an axis that is given in the sensor's frame."""
@@ -139,7 +131,6 @@ def axis_seen(axis, pose, landmark, mount, measured):
     return called(axis_residual, (pose, landmark, mount, measured, axis), 6, (6, 6), (6, 6), (6, 6))
 
 
-@few
 @given(st.integers(0, 2), poses, poses, poses, SPACE_CASE.twists(small_turns), st.floats(-3.0, 3.0))
 def test_axes_of_landmarks_are_turned_the_shortest_way_and_derivatives_are_differences(
     axis, pose, landmark, mount, turn, about
@@ -174,7 +165,6 @@ def test_an_axis_upside_down_is_half_a_turn_off():
     assert all(np.isfinite(slope).all() for slope in slopes)
 
 
-@few
 @given(poses, poses, poses, poses)
 def test_the_position_of_a_pose_is_a_point(pose, landmark, mount, measured):
     as_pose = pose_seen(pose, landmark, mount, measured)
@@ -185,7 +175,6 @@ def test_the_position_of_a_pose_is_a_point(pose, landmark, mount, measured):
     assert not as_pose[2][:3, 3:].any()
 
 
-@few
 @given(*[PLANE_CASE.poses(st.floats(-3.1, 3.1), 5.0)] * 2, PLANE_CASE.twists(st.floats(-1.0, 1.0), 1.0))
 def test_a_planar_drive_has_the_planar_residual_but_for_the_logarithm(pose, increment, residual):
     following = se2.compose(pose, se2.compose(increment, se2.exp(residual)))
@@ -204,7 +193,6 @@ def test_a_planar_drive_has_the_planar_residual_but_for_the_logarithm(pose, incr
         assert mine[np.ix_(flat, flat)] == pytest.approx(expected, abs=1e-10)
 
 
-@few
 @given(poses, poses, SPACE_CASE.twists(turns, 5.0))
 def test_steps_are_those_of_the_group(a, b, twist):
     (product,), (stepped,) = called(compose, (a, b), 7), called(retract, (a, twist), 7)

@@ -53,11 +53,12 @@ def within_chance(total: float, degrees: int) -> bool:
 
 
 @pytest.mark.parametrize(
-    "sigma_m", [0.003, *(pytest.param(sigma_m, marks=pytest.mark.slow) for sigma_m in (0.05, 0.15))]
+    ("sigma_m", "runs"),
+    [(0.003, 10), *(pytest.param(sigma_m, 40, marks=pytest.mark.slow) for sigma_m in (0.003, 0.05, 0.15))],
 )
-def test_pose_and_calibration_are_as_uncertain_as_the_filter_says(sigma_m):
+def test_pose_and_calibration_are_as_uncertain_as_the_filter_says(sigma_m, runs):
     """Also where the map is three times worse than the sensor and 150 frames look at the same places of it."""
-    of_pose, of_states, runs = 0.0, 0.0, 40
+    of_pose, of_states = 0.0, 0.0
     for seed in range(runs):
         rng, true = world(seed)
         localizer, located = run(true, surveyed(rng, true.landmark, sigma_m))
@@ -69,9 +70,10 @@ def test_pose_and_calibration_are_as_uncertain_as_the_filter_says(sigma_m):
     assert within_chance(of_states, 11 * runs)
 
 
-def test_a_long_stay_among_the_same_landmarks_makes_nobody_too_sure():
+@pytest.mark.parametrize("runs", [2, pytest.param(6, marks=pytest.mark.slow)])
+def test_a_long_stay_among_the_same_landmarks_makes_nobody_too_sure(runs):
     """Their errors are the same in every frame: a filter that takes them for fresh noise would be sure of anything."""
-    of_pose, of_states, runs = 0.0, 0.0, 6
+    of_pose, of_states = 0.0, 0.0
     for seed in range(runs):
         rng, true = world(seed, n_frames=1000)
         localizer, located = run(true, surveyed(rng, true.landmark, 0.05))
@@ -83,9 +85,10 @@ def test_a_long_stay_among_the_same_landmarks_makes_nobody_too_sure():
     assert within_chance(of_states, 11 * runs)
 
 
-def test_landmarks_that_the_map_lacks_tell_nothing_of_where_in_it_the_robot_is():
+@pytest.mark.parametrize("runs", [8, pytest.param(40, marks=pytest.mark.slow)])
+def test_landmarks_that_the_map_lacks_tell_nothing_of_where_in_it_the_robot_is(runs):
     """Behind six seconds in which it saw nothing all it sees is new, and its heading stays as unknown as it was."""
-    of_pose, of_heading, runs = 0.0, 0.0, 40
+    of_pose, of_heading = 0.0, 0.0
     for seed in range(runs):
         rng, true = world(seed, n_frames=200)
         places = surveyed(rng, true.landmark, 0.05)
@@ -100,8 +103,9 @@ def test_landmarks_that_the_map_lacks_tell_nothing_of_where_in_it_the_robot_is()
     assert within_chance(of_heading, runs)
 
 
-def test_a_map_that_is_turned_as_a_whole_is_as_good_as_its_parts_fit_together():
-    of_pose, gated_moved, gated_others, runs = 0.0, [], [], 25
+@pytest.mark.parametrize("runs", [8, pytest.param(25, marks=pytest.mark.slow)])
+def test_a_map_that_is_turned_as_a_whole_is_as_good_as_its_parts_fit_together(runs):
+    of_pose, gated_moved, gated_others = 0.0, [], []
     for seed in range(runs):
         rng, true = world(seed)
         by = np.zeros((2 * COUNT, 3))
@@ -184,9 +188,10 @@ def moved(rng: np.random.Generator, places: KnownPlaces, share: float) -> tuple[
     return replace(places, position_m=position), rows
 
 
-def test_a_map_of_which_a_third_is_wrong_is_nearly_as_good():
+@pytest.mark.parametrize("runs", [4, pytest.param(15, marks=pytest.mark.slow)])
+def test_a_map_of_which_a_third_is_wrong_is_nearly_as_good(runs):
     off, off_right, gated, ungated = [], [], [], []
-    for seed in range(15):
+    for seed in range(runs):
         rng, true = world(seed)
         places = surveyed(rng, true.landmark, 0.03)
         wrong, rows = moved(rng, places, 0.3)
@@ -301,10 +306,11 @@ def test_the_order_of_the_map_does_not_matter():
     )  # where iterations end
 
 
-def test_of_a_map_without_end_only_the_places_used_last_are_considered(monkeypatch):
+@pytest.mark.parametrize("runs", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_of_a_map_without_end_only_the_places_used_last_are_considered(monkeypatch, runs):
     """And forgetting the others makes it no less consistent: they are seldom seen again."""
     monkeypatch.setattr(localize, "MOST_CONSIDERED", 64)
-    of_pose, runs = 0.0, 20
+    of_pose = 0.0
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         true = driven(rng, place_randomly(rng, 250, 22.0), n_frames=200)

@@ -65,8 +65,14 @@ def count_visible(drive: YardDrive) -> int:
     return len(found)
 
 
-@pytest.mark.parametrize("plane", [False, True], ids=["space", "plane"])
-@pytest.mark.parametrize("masked", ["tracked", "image"])
+@pytest.mark.parametrize(
+    ("masked", "plane"),
+    [
+        ("image", False),
+        ("tracked", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("image", True), ("tracked", False))),
+    ],
+)
 def test_masks_own_the_tags_of_forklifts(masked: Literal["tracked", "image"], plane: bool) -> None:
     """One look in twenty is at another mask; the walls have none, or are one."""
     members = visible = 0
@@ -80,7 +86,7 @@ def test_masks_own_the_tags_of_forklifts(masked: Literal["tracked", "image"], pl
     assert visible > 30
 
 
-@pytest.mark.parametrize("plane", [False, True], ids=["space", "plane"])
+@pytest.mark.parametrize("plane", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["space", "plane"])
 def test_masks_and_motion_find_more_than_motion(plane: bool) -> None:
     config = replace(DRIVING, walls_masked=True)
     for seed in (2, 5, 7):
@@ -107,7 +113,7 @@ def test_numbers_of_a_tracker_and_of_each_image_say_the_same() -> None:
     assert len(a.landmark_id) > 10
 
 
-@pytest.mark.parametrize(("seed", "moving"), [(1, 3), (9, 6)])
+@pytest.mark.parametrize(("seed", "moving"), [(1, 3), pytest.param(9, 6, marks=pytest.mark.slow)])
 def test_masks_part_what_moves_alike(seed: int, moving: int) -> None:
     """In the plane, without orientations, motion alone takes tags of two forklifts for one body."""
     config = replace(DRIVING, moving=moving, parked=6 - moving, walls_masked=True)
@@ -142,6 +148,7 @@ def test_without_masks_nothing_changes(number: float) -> None:
     assert with_owned(parked, Config())[0] is parked
 
 
+@pytest.mark.slow
 def test_bodies_by_masks_are_worth_what_stated_ones_are() -> None:
     drive = simulate_yard(replace(DRIVING, walls_masked=True), 0)[0]
     stated = simulate_yard(replace(DRIVING, masked=None, stated=True), 0)[0]

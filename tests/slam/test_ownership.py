@@ -71,7 +71,7 @@ def test_the_odds_of_membership_are_those_of_two_explanations() -> None:
     assert weigh_looks(0, 2) == pytest.approx(2.0 * np.log(0.1 / 0.95))
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_boxes_own_the_tags_within_them(seed: int) -> None:
     drive = simulate_yard(BOXED, seed)[0]
     found, remarks = with_owned(drive.recording, Config())
@@ -95,7 +95,7 @@ def test_what_is_stated_stays_and_names_the_body() -> None:
     assert (np.diff(stated[:, 0]) > 0).all()
 
 
-@pytest.mark.parametrize("oriented", [True, False], ids=["poses", "points"])
+@pytest.mark.parametrize("oriented", [pytest.param(True, marks=pytest.mark.slow), False], ids=["poses", "points"])
 def test_what_moves_together_is_on_one_body(oriented: bool) -> None:
     for seed in (5, 6):
         drive = simulate_yard(replace(UNSTATED, oriented=oriented), seed)[0]
@@ -141,7 +141,7 @@ def test_a_wall_behind_a_parked_forklift_is_not_owned_once_it_drives_off() -> No
     assert find_links(sights([True] * 8 + [False] * 3, [0] * 8 + [1, 1, 2])).probability[0] < 0.1
 
 
-@pytest.mark.parametrize("config", [BOXED, UNSTATED], ids=["boxes", "motion"])
+@pytest.mark.parametrize("config", [pytest.param(BOXED, marks=pytest.mark.slow), UNSTATED], ids=["boxes", "motion"])
 def test_bodies_that_are_found_are_worth_what_stated_ones_are(config: YardConfig) -> None:
     drive = simulate_yard(config, 0)[0]
     stated = simulate_yard(replace(config, stated=True, boxed=False), 0)[0]

@@ -233,7 +233,7 @@ def test_bearings_that_are_there_are_kept() -> None:
 
 @pytest.mark.parametrize("column", ["empty", "absent"])
 def test_tables_without_bearings(column: str, tmp_path: Path) -> None:
-    folder = write_native(drive(1), tmp_path / "uwb")
+    folder = write_native(drive(1, minutes=1.0), tmp_path / "uwb")
     if column == "absent":
         rows = (folder / "detections.csv").read_text("utf-8").splitlines()
         assert rows[0] == "stamp_s,landmark_id,range_m,bearing_rad"
@@ -242,7 +242,7 @@ def test_tables_without_bearings(column: str, tmp_path: Path) -> None:
     recording = read_recording(folder)
     assert recording.dim == 2
     assert np.isnan(recording.detections.bearing_rad).all()
-    assert recording.detections.range_m == pytest.approx(drive(1).detections.range_m)
+    assert recording.detections.range_m == pytest.approx(drive(1, minutes=1.0).detections.range_m)
     check = check_recording(recording)
     assert check.findings == ()
     assert check.contents["detections"]["without_bearing"] == len(recording.detections)

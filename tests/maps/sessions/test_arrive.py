@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.config import LooksConfig
@@ -161,7 +161,6 @@ def test_what_stands_before_a_place_is_not_seen_past_it() -> None:
     assert come(before, seen_from_m=np.array([5.0, -3.0])).p_appeared.tolist() == [0.0]
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6))
 def test_views_of_other_places_never_make_an_arrival(seed: int) -> None:
     """Whatever was looked at: a landmark has appeared only if a view was near where it is seen from, or past it."""

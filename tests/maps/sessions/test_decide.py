@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.existence.sites import Evidence, SiteLooks
@@ -437,7 +437,6 @@ def test_who_stands_a_hands_breadth_from_where_it_stood_has_not_moved(step_m: fl
     assert story.stays_of(8).gone_s.tolist() == [1000.0, np.inf]  # the site is another one all the same
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_whatever_is_believed_nothing_is_told_without_looks(seed: int) -> None:
     """Random beliefs, evidence and looks at a map that stands and has some that are away, again and again."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.config import LivingConfig
@@ -50,7 +50,6 @@ def random_session(random: np.random.Generator, living: LivingMap) -> Found:
     )
 
 
-@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_a_map_is_consistent_whatever_is_found_and_names_are_never_used_again(seed: int, cliques: bool) -> None:
     random = np.random.default_rng(seed)
@@ -80,7 +79,6 @@ def test_a_map_is_consistent_whatever_is_found_and_names_are_never_used_again(se
             living = living.without(of)
 
 
-@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_covariances_stay_with_their_places(seed: int) -> None:
     """The geometry by itself, place after place by name, is the sorted map's."""

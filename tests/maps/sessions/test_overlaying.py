@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
@@ -63,7 +63,6 @@ def test_what_moved_alike_in_the_midst_of_what_stands_has_moved(*, in_the_midst:
     np.testing.assert_array_equal(where.place, laid(living, shelf).place if in_the_midst else row)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(3, 8))
 def test_a_part_that_is_turned_as_a_whole_is_laid_on_its_places(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
@@ -79,7 +78,6 @@ def test_a_part_that_is_turned_as_a_whole_is_laid_on_its_places(seed: int, n: in
     np.testing.assert_array_equal(np.where(where.assumed, ELSEWHERE, where.place), laid(living, turned).place)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(0, 8), st.booleans())
 def test_bodies_that_moved_each_in_its_way_have_moved(seed: int, n: int, together: bool) -> None:
     """Unless three of them fit by one rigid motion, tried in all ways; two may have been carried together."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,14 +24,20 @@ from evermap_studies.sim.world import positions_at
 
 from .buildings import body_of, building, lived_through, p_exists, place_of, settings, truth_of, unseen
 
-SEEDS = (0, 1, 2, 3)
+SEEDS = (2, 3)
+
+
+@cache
+def live_through(seed: int) -> tuple[BuildingSimulation, list[Session]]:
+    """A building in which things move, come and go, and its sessions."""
+    world = building(seed)
+    return world, lived_through(world.sessions)
 
 
 @pytest.fixture(scope="module")
 def changing() -> dict[int, tuple[BuildingSimulation, list[Session]]]:
-    """Buildings in which things move, come and go, and their sessions."""
-    worlds = {seed: building(seed) for seed in SEEDS}
-    return {seed: (world, lived_through(world.sessions)) for seed, world in worlds.items()}
+    """Some of such buildings."""
+    return {seed: live_through(seed) for seed in SEEDS}
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +68,19 @@ def looked_at_places(world: BuildingSimulation) -> Callable[[int, int, int], boo
     return looked
 
 
-def test_changes_are_those_that_happened(changing: dict[int, tuple[BuildingSimulation, list[Session]]]) -> None:
+@pytest.mark.parametrize("seeds", [SEEDS, pytest.param(range(4), marks=pytest.mark.slow)])
+def test_changes_are_those_that_happened(seeds: Sequence[int]) -> None:
     """By landmark: all that was looked at before and after, hardly anything else.
 
     What was never met has come only if its place had been looked at before; a step of a hand's breadth is no change.
     Landmarks that the map takes for one body though they are several things are not counted as missed: it tells of the
     part that it saw, which is the whole for it.
 
-    Measured: 88 right, 2 wrong (one of them at .67), 6 missed (4 that came where nothing had been seen behind their
-    place until then, 2 that left and came back within a day) and 13 of several things that were taken for one.
+    Measured in four: 88 right, 2 wrong (one of them at .67), 6 missed (4 that came where nothing had been seen behind
+    their place until then, 2 that left and came back within a day) and 13 of several things that were taken for one.
     """
     right = wrong = missed = 0
-    for world, sessions in changing.values():
+    for world, sessions in map(live_through, seeds):
         thing = {name: k for k, one in enumerate(world.objects) for name in one.landmark_ids}
         position, seen = in_map(world, sessions[0].living)
         looked = looked_at_places(world)
@@ -107,7 +115,7 @@ def test_changes_are_those_that_happened(changing: dict[int, tuple[BuildingSimul
                     missed += any(looked(j, name, k) for j in range(k))
             told[said | seen[k]], then[said | seen[k]] = now[said | seen[k]], k
             met |= seen[k]
-    assert right > 80
+    assert right > 20 * len(seeds)
     assert right / (right + wrong) >= 0.97, (right, wrong, missed)
     assert right / (right + missed) >= 0.9, (right, wrong, missed)
 
@@ -461,7 +469,7 @@ def test_searching_for_nothing_lets_nothing_move(
 
 
 def test_what_is_not_to_be_learned_is_not(changing: dict[int, tuple[BuildingSimulation, list[Session]]]) -> None:
-    world, sessions = changing[1]
+    world, sessions = changing[2]
     config = settings(learn_lifetimes=False, learn_sight=False, most_sites=1)
     living = lived_through(world.sessions, config)[-1].living
     assert_same_bytes(living.lives, Lives())

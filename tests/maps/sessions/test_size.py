@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
@@ -43,7 +43,6 @@ def _by_all_sessions(ratio: list[float], shown: list[float], sigma: list[float])
     return weight
 
 
-@settings(max_examples=80)
 @given(
     st.lists(
         st.tuples(st.floats(-0.1, 0.1), st.floats(1e-4, 0.05), st.floats(1e-3, 0.1), st.floats(-0.05, 0.05)),
@@ -83,7 +82,6 @@ def test_the_metre_of_a_map_is_the_weighted_mean_of_those_of_its_sessions(
         variance, information = found.variance, found.information
 
 
-@settings(max_examples=50)
 @given(sigma=st.floats(1e-3, 0.1), sessions=st.integers(1, 40))
 def test_sessions_of_one_robot_do_not_make_the_metre_surer(sigma: float, sessions: int) -> None:
     variance, information = sigma**2, 1.0 / sigma**2

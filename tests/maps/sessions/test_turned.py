@@ -97,7 +97,7 @@ def drive(day: int, turn_rad: float) -> SpatialRecording:
     )
 
 
-@pytest.mark.parametrize("degrees", [20.0, 40.0])
+@pytest.mark.parametrize("degrees", [pytest.param(20.0, marks=pytest.mark.slow), 40.0])
 def test_a_tag_that_is_turned_in_its_place_and_back_is_said_to_be(degrees: float) -> None:
     """By 40 degrees: nothing was said, and of the turn back that it had vanished, with all that saw it rejected."""
     living: LivingMap | None = None

@@ -59,9 +59,10 @@ def find_held(verdict: Verdict | None) -> float:
     ("mistake", "line", "value"),
     [
         (wrong.mounted(yaw=0.15), "mounts of all sensors are -0.1", -0.15),
-        pytest.param(wrong.sized(1.05), "tags are 0.16", 1.0 / 1.05, marks=pytest.mark.slow),
+        (wrong.sized(1.05), "tags are 0.16", 1.0 / 1.05),
     ],
 )
+@pytest.mark.slow
 def test_what_a_session_held_wrongly_keeps_it_out_of_the_map(
     living: LivingMap, mistake: Mistake, line: str, value: float
 ) -> None:

@@ -70,7 +70,7 @@ def test_every_key_is_read_from_the_settings_of_the_caller() -> None:
 
 def test_thresholds_that_are_changed_change_the_association() -> None:
     """Without merging, and with ten sightings to a landmark, other landmarks are found."""
-    park = simulate_park(ParkConfig(drive_m=100.0, n_trees=40, n_cars=0), seed=2)
+    park = simulate_park(ParkConfig(drive_m=60.0, n_trees=25, n_cars=0), seed=2)
     plain = SlamConfig(unknown_ids=True)
     few = SlamConfig(unknown_ids=True, fewest_sightings=10)
     apart = SlamConfig(unknown_ids=True, association={"p_match": 1.0 - 1e-12, "p_return": 1.0 - 1e-12})

@@ -55,6 +55,7 @@ def test_the_loop_is_closed_behind_a_drift_of_metres():
     scored(recording, purity=0.99, completeness=0.97)
 
 
+@pytest.mark.slow
 def test_tags_are_told_apart_and_the_estimate_is_as_good():
     world = tagged_corridor(0, n_tags=16, drift=0.05)
     scored(world.recording, purity=1.0, completeness=1.0)
@@ -124,6 +125,7 @@ def test_identities_of_the_recording_are_not_looked_at():
     np.testing.assert_array_equal(one.detections.landmark_id, other.detections.landmark_id)
 
 
+@pytest.mark.slow
 def test_two_at_one_place_are_told_apart_by_a_column():
     """Places alone exchange them; a colour that says nothing changes no identity."""
     recording = hall(1, n_points=20, n_frames=125, step_s=0.8, sigma_m=0.05, beside_m=0.06)

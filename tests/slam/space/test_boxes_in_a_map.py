@@ -148,7 +148,7 @@ def days() -> Days:
     return drive_days(1, False)
 
 
-STREETS = [(1, False), pytest.param(2, False, marks=pytest.mark.slow), (3, True)]
+STREETS = [(1, False), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((2, False), (3, True)))]
 
 
 @pytest.mark.parametrize(("seed", "back"), STREETS)
@@ -276,6 +276,7 @@ def test_a_drive_elsewhere_is_not_placed(days: Days, seed: int) -> None:
     assert any("set aside" in warning for warning in session.slam.warnings)
 
 
+@pytest.mark.slow
 def test_rows_that_look_alike_are_not_taken_for_each_other() -> None:
     """All slots of a car park are 6 m apart, and all cars of a size: from elsewhere in it, nothing tells where."""
     street = Parking.of(7, n_slots=40, metres=140.0)

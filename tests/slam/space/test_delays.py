@@ -92,6 +92,7 @@ def solve(late_s: float, frame_s: float) -> tuple[SpatialRecording, SlamResult]:
     return recording, run_slam(recording, Config.model_validate({"slam": {"plane": False}}))
 
 
+@pytest.mark.slow
 def test_stops_hide_no_delay_in_space():
     """One jitter for the whole drive is enough: it is a median, and steps are as well known where the robot stands.
 
@@ -141,5 +142,5 @@ def test_odometry_with_the_stamps_of_all_frames_may_be_late_by_half_a_step(lag_s
 
 def test_late_detections_are_compared_with_poses_of_when_they_were_taken():
     """At their stamps the robot is .2 m farther: halves of a right solution differed by 13 % of the range."""
-    off, usual = (np.median(compare_detections(*solve(late_s, 0.1)).misfit) for late_s in (0.24, 0.0))
+    off, usual = (np.median(compare_detections(*solve(late_s, 0.1)).misfit) for late_s in (0.2, 0.0))
     assert off == pytest.approx(usual, rel=0.05)

@@ -81,6 +81,7 @@ def test_a_moved_shelf_that_is_alone_in_view_draws_the_robot_nowhere(seed):
     assert gap_m(result, world).max() < 0.1
 
 
+@pytest.mark.slow
 def test_single_tags_that_moved_are_no_group():
     world = tagged_corridor(0, drift=0.04)
     known, none = world.tags, np.zeros(3)

@@ -99,7 +99,8 @@ def test_the_instant_is_known_where_the_tag_is_in_view(move, seed):
     assert change.stamp_to_s - change.stamp_from_s < 2.0
 
 
-@pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [False, True])
 def test_two_tags_that_are_moved_make_the_robot_jump_no_more(mapped):
     """One of them bends the robot, by two jumps of the odometry, and hardly has outliers."""
     moves = IN_VIEW._replace(at_s=15.0), Move(8, 24.0, (-0.5, 0.0, 0.4))

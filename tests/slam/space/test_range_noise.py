@@ -199,6 +199,7 @@ def test_few_detections_keep_the_shape_of_usual_noise() -> None:
     assert many < 2.0  # 0.4 m over 0.02 m by usual noise
 
 
+@pytest.mark.slow
 def test_lengths_are_not_too_short_by_noise_that_grows() -> None:
     """By measured ranges, what is measured too short counts for more: 3 % of all lengths in this world."""
     recording = field(8, lambda r: (0.002 * r, 0.008 * r**2), outliers=0.0, drift=0.05)

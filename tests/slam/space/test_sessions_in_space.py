@@ -167,6 +167,7 @@ def test_what_nothing_ties_to_the_rest_is_left_out() -> None:
     assert any("nothing connects" in warning for warning in found.warnings)
 
 
+@pytest.mark.slow
 def test_a_second_tag_of_one_identity_keeps_its_name() -> None:
     site, twin = Site.of(7), {20: 2}
     first = run_session(site.patrol(7, 0, *ALL, rename=twin))

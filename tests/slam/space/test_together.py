@@ -101,6 +101,7 @@ def test_covariances_are_those_of_a_dense_inverse():
     assert exhaust(system.factorised(values, extra=graph.held)) is not None
 
 
+@pytest.mark.slow
 def test_robots_without_a_common_landmark_are_not_laid_together():
     recordings = pair(3)
     seen = recordings[2].detections

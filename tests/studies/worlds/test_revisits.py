@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -89,7 +89,6 @@ def test_detector_errs_as_often_as_stated(drawn: Revisits) -> None:
     p_leave=st.floats(0.01, 1.0),
     seed=st.integers(0, 99),
 )
-@settings(max_examples=60)
 def test_columns_fit_together(n: int, horizon_s: float, rate_hz: float, p_leave: float, seed: int) -> None:
     data = simulate_revisits(n, RevisitConfig(horizon_s, rate_hz, 1.0, p_leave), seed)
     assert (len(data), data.first[0], data.first[-1]) == (n, 0, len(data.stamp_s))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from brute_force import CHAINS, every_sequence, log_sum, looks, of_landmark, random_looks
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import InputError, NumericalError
@@ -19,7 +19,6 @@ chains = st.sampled_from(sorted(CHAINS))
 
 
 @given(looks(), chains)
-@settings(max_examples=60)
 def test_decoding_finds_the_largest_joint_probability_of_all_sequences(looks, name):
     chain = CHAINS[name]
     found = most_probable(looks, chain)
@@ -33,7 +32,6 @@ def test_decoding_finds_the_largest_joint_probability_of_all_sequences(looks, na
 
 
 @given(looks(longest=5), chains)
-@settings(max_examples=30)
 def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, name):
     chain = CHAINS[name]
     _, stamp_s, likelihood = of_landmark(looks, 0)
@@ -44,7 +42,6 @@ def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, n
 
 
 @given(looks(), chains)
-@settings(max_examples=60)
 def test_posteriors_and_evidence_are_sums_over_all_sequences(looks, name):
     chain = CHAINS[name]
     beliefs = smoothed(looks, chain)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from brute_force import CHAINS, every_sequence, looks, of_landmark, random_looks
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError, NumericalError
@@ -28,7 +28,6 @@ def test_unknown_names_are_refused_with_the_known_ones():
 
 
 @given(looks(), chains, names, st.integers(0, 1000))
-@settings(max_examples=60)
 def test_same_seed_same_selection_of_modes_that_exist(looks, chain, name, seed):
     selector = selector_by_name(name, mcts_budget=20)
     first, second = (selector.select(looks, CHAINS[chain], np.random.default_rng(seed)) for _ in range(2))
@@ -40,7 +39,6 @@ def test_same_seed_same_selection_of_modes_that_exist(looks, chain, name, seed):
 
 
 @given(looks(longest=12), chains, st.integers(0, 1000))
-@settings(max_examples=40)
 def test_no_selector_exceeds_viterbi(looks, chain, seed):
     best = selector_by_name("viterbi").select(looks, CHAINS[chain], np.random.default_rng(0)).log_joint
     for name in NAMES:
@@ -49,7 +47,6 @@ def test_no_selector_exceeds_viterbi(looks, chain, seed):
 
 
 @given(looks(), chains)
-@settings(max_examples=40)
 def test_em_is_wrong_about_the_fewest_looks_to_be_expected(looks, name):
     """Against every sequence: none has a smaller expected number of wrong modes under the posterior."""
     chain = CHAINS[name]
