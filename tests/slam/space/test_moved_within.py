@@ -25,7 +25,7 @@ from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.marginal import _cost_of_outliers
 from evermap.slam.space.problem import SpatialNoise
 from evermap.slam.space.solve import solve_space
-from evermap.types import ChangeKind, Frames, SlamResult, SpatialRecording
+from evermap.types import ANY_RANGE_M2, ChangeKind, Frames, SlamResult, SpatialRecording
 
 from .corridors import Move, World, as_poses, tagged_corridor
 
@@ -97,6 +97,60 @@ def test_the_instant_is_known_where_the_tag_is_in_view(move, seed):
     world = tagged_corridor(seed, moves=(move,))
     (change,) = check_moves(world, world.recording, (move,), mapped=False).changes
     assert change.stamp_to_s - change.stamp_from_s < 2.0
+
+
+def as_directions(world: World, seed: int, sigma_rad: float = 0.001) -> SpatialRecording:
+    """The same drive, of every tag only where it is seen, not how far away."""
+    recording = as_poses(world, seed, 1e-4, 0.02)
+    at = recording.detections.position_sensor_m
+    at = at / np.linalg.norm(at, axis=1, keepdims=True)
+    at = at + np.cross(at, sigma_rad * np.random.default_rng(seed).normal(size=at.shape))
+    at /= np.linalg.norm(at, axis=1, keepdims=True)
+    along = at[:, :, None] * at[:, None, :]
+    covariance = sigma_rad**2 * (np.eye(3) - along) + 2.0 * ANY_RANGE_M2 * along
+    nothing = {"rotation": np.full((len(at), 4), np.nan), "sigma_rad": np.full(len(at), np.nan)}
+    seen = replace(recording.detections, position_sensor_m=at, covariance_sensor_m2=covariance, **nothing)
+    return replace(recording, detections=seen)
+
+
+@pytest.mark.parametrize(
+    ("move", "mapped"),
+    [
+        (Move(3, 8.0, (0.6, 0.0, 0.3)), True),
+        (Move(5, 20.0, (0.0, 0.5, 0.0)), True),
+        (Move(3, 8.0, (0.6, 0.0, 0.3)), False),
+    ],
+)
+def test_a_landmark_of_which_only_directions_are_seen_is_moved(move, mapped):
+    """Its ranges were triangulated from sightings of both places, where it is seen at both within a while. Poses may be
+    bent until what is seen of both meets at one point.
+    """
+    world = tagged_corridor(4, moves=(move,))
+    check_moves(world, as_directions(world, 4), (move,), mapped=mapped)
+
+
+@pytest.mark.parametrize(("strays", "cut"), [(0, 30), (4, 30), (0, 18), (0, 60)])
+def test_directions_part_where_they_meet_at_two_points(strays, cut):
+    """Exact directions with a milliradian of noise from a curve; some stray far off; none part at one point."""
+    random = np.random.default_rng(7)
+    angle = np.linspace(0.0, 2.0, 60)
+    eye_m = np.column_stack([3.0 * np.cos(angle), 3.0 * np.sin(angle), 0.1 * angle])
+    both_m = np.array([[0.2, -0.1, 1.0], [0.2, 0.4, 1.0]])
+    ahead = both_m[(np.arange(60) >= cut).astype(int)] - eye_m
+    ahead[7 : 7 + 9 * strays : 9] += 1.0
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    ahead += 1e-3 * random.normal(size=ahead.shape)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    parted = moved_within._part_rays(eye_m, ahead, np.full(60, 1e-3), 3)
+    if cut == 60:
+        assert parted is None
+        return
+    assert parted is not None
+    assert parted[0] == cut
+    assert np.array(parted[1:]) == pytest.approx(both_m, abs=0.01)
+    assert (
+        moved_within._part_rays(eye_m[cut - 3 : cut + 2], ahead[cut - 3 : cut + 2], np.full(5, 1e-3), 3) is None
+    )  # too few
 
 
 @pytest.mark.slow
@@ -180,13 +234,12 @@ def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
     """Beside the same others, or with those that are asked now left out."""
     asked, left_out = [], []
 
-    def ask(_optimum, _free, _at, row, _interval):
+    def ask(_optimum, _free, row, _interval):
         asked.append(row)
 
     monkeypatch.setattr(moved_within, "_without", lambda _, suspects: left_out.append(suspects.tolist()))
-    monkeypatch.setattr(moved_within, "as_seen", lambda *_: None)
     monkeypatch.setattr(moved_within, "_at_two_places", ask)
-    optimum = SimpleNamespace(smoother=SimpleNamespace(problem=SimpleNamespace(measured=None)))
+    optimum = SimpleNamespace()
     _, single = moved_within.find_two_places(optimum, np.array([4, 1, 0, 2, 8]), 0.95, frozenset({1}))
     assert asked == [4, 0, 2, 8]
     found = moved_within.find_two_places(optimum, np.array([4, 1, 0, 2, 8, 7]), 0.95, single)

@@ -34,6 +34,8 @@ ROUNDS = 4
 """Moves that are found, at most."""
 STEPS = 10
 """Gauss-Newton steps without a suspect, and with its move, at most."""
+MEETINGS, LEAST_RANGE_M = 10, 0.1
+"""Times that a point where directions meet is found, in turn with their weights; and its range, at least [m]."""
 UNUSED = 1e-9
 """Share of the information of detections that are left out."""
 MOST_CENTRES = 60
@@ -123,9 +125,13 @@ def list_movers(optimum: SpatialOptimum, identity: IntArray, asked: BoolArray, o
 
 
 def _is_parted(optimum: SpatialOptimum, row: int) -> bool:
-    """Tell whether the sightings of a place are of two places in turn."""
-    problem = optimum.smoother.problem
-    at = as_seen(problem, optimum.estimate, problem.measured)[problem.place == row]
+    """Tell whether the sightings of a place are of two places in turn, by themselves or by where others put it."""
+    problem, estimate = optimum.smoother.problem, optimum.estimate
+    mine = np.flatnonzero(problem.place == row)
+    if _part_sightings(optimum, estimate, mine) is not None:
+        return True
+    # poses that are bent to one point for two let directions meet there; ranges are of the odometry, which isn't bent
+    at = as_seen(problem, estimate, problem.measured)[mine]
     return _part_in_two(at, bool(problem.oriented[row]), problem.settings.repair.fewest) is not None
 
 
@@ -186,10 +192,9 @@ def _find_among(
     if not asked:
         return None, single
     free = _without(optimum, suspects)
-    at = as_seen(optimum.smoother.problem, free, optimum.smoother.problem.measured)
     found = list[TwoPlaces]()
     for row in asked:
-        two = _at_two_places(optimum, free, at, row, interval)
+        two = _at_two_places(optimum, free, row, interval)
         if two is None:
             single |= {row}
         else:
@@ -202,15 +207,12 @@ def _find_among(
     return best._replace(optimum=better, nats=nats), single
 
 
-def _at_two_places(
-    optimum: SpatialOptimum, free: SpatialEstimate, at: FloatArray, row: int, interval: float
-) -> TwoPlaces | None:
+def _at_two_places(optimum: SpatialOptimum, free: SpatialEstimate, row: int, interval: float) -> TwoPlaces | None:
     """The optimum with a landmark at two places; None where it was seen at both in turns, or is at one.
 
     Args:
         optimum: with one place.
         free: values without what is suspected.
-        at: (M, 7) where detections put their places then.
         row: the place.
         interval: as of `find_two_places`.
     """
@@ -218,7 +220,7 @@ def _at_two_places(
     mine = np.flatnonzero(problem.place == row)
     if len(mine) < 2 * settings.repair.fewest:
         return None
-    parted = _part_in_two(at[mine], bool(problem.oriented[row]), settings.repair.fewest)
+    parted = _part_sightings(optimum, free, mine)
     if parted is None:
         return None
     cut, old, new = parted
@@ -274,6 +276,65 @@ def _settle(problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise
     start, _ = smoother.optimum(start, noise, heavy=True, iterations=STEPS)
     estimate, now = smoother.optimum(start, noise, heavy=False, iterations=STEPS)
     return SpatialOptimum(estimate, noise, smoother, now)
+
+
+def _part_sightings(
+    optimum: SpatialOptimum, estimate: SpatialEstimate, mine: IntArray
+) -> tuple[int, FloatArray, FloatArray] | None:
+    """Return how sightings (K,) of one landmark part into those of two places, along given values; None if it is one.
+
+    The ranges of directions are no part of it: they were triangulated as if everything stood, from sightings of both
+    places where these are close in time.
+    """
+    problem, fewest = optimum.smoother.problem, optimum.smoother.problem.settings.repair.fewest
+    at = as_seen(problem, estimate, problem.measured)[mine]
+    if not problem.ray[mine].any():
+        return _part_in_two(at, bool(problem.oriented[problem.place[mine[0]]]), fewest)
+    eye_m = as_seen(problem, estimate, se3.identity(len(problem.place)))[mine, :3]
+    range_m = np.linalg.norm(problem.measured[mine, :3], axis=1)
+    sigma_rad = optimum.noise.across * problem.sigma_position_m[mine, 0] / range_m
+    parted = _part_rays(eye_m, (at[:, :3] - eye_m) / range_m[:, None], sigma_rad, fewest)
+    if parted is None:
+        return None
+    cut, *both_m = parted
+    old, new = se3.identity(2)
+    old[:3], new[:3] = both_m
+    return cut, old, new
+
+
+def _part_rays(
+    eye_m: FloatArray, ahead: FloatArray, sigma_rad: FloatArray, fewest: int
+) -> tuple[int, FloatArray, FloatArray] | None:
+    """Return as `_part_in_two`, with points (3,), of directions `ahead` (N, 3) from `eye_m` (N, 3): by the points at
+    which those before and after each cut meet best. How far directions miss one point is told by the best cut: poses
+    err, too.
+    """
+    count = len(eye_m)
+    if count < 2 * fewest:
+        return None
+    cuts = np.unique(np.linspace(fewest, count - fewest, min(count, MOST_CENTRES)).astype(np.int64))
+    before = np.arange(count) < cuts[:, None]
+    sides = np.concatenate([np.ones((1, count), dtype=np.bool_), before, ~before])
+    across = (np.eye(3) - ahead[:, :, None] * ahead[:, None, :]) / sigma_rad[:, None, None] ** 2
+    weight, range_m = sides.astype(np.float64), np.ones(sides.shape)
+    middle_m = eye_m.mean(axis=0)
+    for _ in range(MEETINGS):
+        scaled = weight / range_m**2
+        total = np.einsum("sn,nij->sij", scaled, across) + UNUSED * np.eye(3)
+        pull = np.einsum("sn,nij,nj->si", scaled, across, eye_m - middle_m)
+        meet_m = middle_m + np.linalg.solve(total, pull[..., None])[..., 0]
+        out = meet_m[:, None] - eye_m
+        range_m = np.maximum(np.linalg.norm(out, axis=2), LEAST_RANGE_M)
+        off = np.arctan2(np.linalg.norm(np.cross(out, ahead), axis=2), (out * ahead).sum(axis=2)) / sigma_rad
+        of_cut = np.where(before, off[1 : 1 + len(cuts)], off[1 + len(cuts) :])
+        off /= max(float(np.median(of_cut, axis=1).min()), 1.0)
+        weight = sides / (1.0 + off**2)
+    loss = np.where(sides, np.minimum(off, FAR), 0.0).sum(axis=1)
+    both = loss[1 : 1 + len(cuts)] + loss[1 + len(cuts) :]
+    best = int(np.argmin(both))
+    if not both[best] <= PARTED * loss[0]:
+        return None
+    return int(cuts[best]), meet_m[1 + best], meet_m[1 + len(cuts) + best]
 
 
 def _part_in_two(at: FloatArray, has_turn: bool, fewest: int) -> tuple[int, FloatArray, FloatArray] | None:
