@@ -214,11 +214,11 @@ def test_the_interval_of_a_departure_holds_the_looks_that_may_have_missed_it() -
     watch = on_laps({2: [(150, END)]})
     asked = np.ones(8, dtype=np.bool_)
     wide = watch._replace(listed=watch.listed._replace(p_detect=np.full(len(watch.listed.pose), 0.6)))
-    (sharp,), (blur,) = find_departures(watch, asked, 0.95), find_departures(wide, asked, 0.95)
+    (sharp,), (blurred,) = find_departures(watch, asked, 0.95), find_departures(wide, asked, 0.95)
     (half,) = find_departures(wide, asked, 0.5)
     p_look = 1.0 - (1.0 - 0.6) ** (1.0 / RULES.sticky)
     ratio = RULES.p_flanked_hidden + (1.0 - RULES.p_flanked_hidden) * (1.0 - p_look)
     looks = np.ceil(np.log(0.025) / np.log(ratio))  # of a geometric sequence
-    assert blur.between_s == (74.5, 74.5 + 0.5 * looks)
-    assert sharp.between_s[1] < blur.between_s[1]
-    assert half.between_s[1] < blur.between_s[1]
+    assert blurred.between_s == (74.5, 74.5 + 0.5 * looks)
+    assert sharp.between_s[1] < blurred.between_s[1]
+    assert half.between_s[1] < blurred.between_s[1]
