@@ -164,8 +164,10 @@ def test_what_is_elsewhere_than_in_a_map_and_moves_in_view_is_carried_about(
     assert not find_carried(result, wrong, others)
 
 
-def test_what_moves_in_view_is_no_certain_move_of_a_map() -> None:
-    given = make_space()
+@pytest.mark.parametrize("make", [make_plane, make_space])
+def test_what_moves_in_view_is_no_certain_move_of_a_map(make: Any) -> None:
+    """Nor is all else of an exact map, seen from the place where the map has what moved, while it was elsewhere."""
+    given = make()
     result = run_slam(carry(given, move_twice), prior_map=given.true_landmarks)
     assert list_codes(result) == [CARRIED]
     assert not result.changes

@@ -412,9 +412,11 @@ def _count_hits(group: MovedGroup, base: Problem, used: BoolArray, stamp_s: Floa
 
 
 def without_common_motion(groups: Groups, seen: IntArray, given: GivenMap) -> Groups:
-    """Return the groups without the largest one where all of the map that was seen moved before the session.
+    """Return the groups without the largest one where nothing of the map that was seen stayed, and most of it moved
+    together before the session.
 
-    Then that is the frame: a shift or a rotation of everything is no change.
+    Then that is the frame: a shift or a rotation of everything is no change. What moved within the session, and was
+    alone at its place until then, gives none.
 
     Args:
         groups: that are thought to have moved.
@@ -424,9 +426,12 @@ def without_common_motion(groups: Groups, seen: IntArray, given: GivenMap) -> Gr
     mapped = np.unique(seen)
     mapped = mapped[given.given[mapped]]
     before = [group for group in groups if group.window == 0]
-    if not (before and len(mapped)) or not np.isin(mapped, np.concatenate([group.members for group in before])).all():
+    if not (before and len(mapped)) or not np.isin(mapped, np.concatenate([group.members for group in groups])).all():
         return groups
     largest = max(before, key=lambda group: len(group.members))
+    stayed = np.setdiff1d(mapped, np.concatenate([group.members for group in before]))
+    if len(stayed) >= len(largest.members):
+        return groups
     return tuple(group for group in groups if group is not largest)
 
 
