@@ -18,10 +18,7 @@ from evermap.maps.living import EXISTS, LivingMap, Places, Sites, class_of, cliq
 from evermap.maps.sessions.extend import Extended, first_and_last
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN, Lines, nominal_lines
-from evermap.survival.base import LifetimePrior
-from evermap.survival.families import Mixture
 from evermap.survival.hazards import never_leaves
-from evermap.survival.logmath import TINY
 from evermap.types import UNKNOWN, FloatArray, IntArray, Sensor, rows_of
 
 WITNESSED_NATS = 50.0
@@ -68,45 +65,18 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
     share = np.where(np.arange(len(row)) == newest[row], 1.0, 1.0 / np.maximum(count[row] - 1, 1))
     total = np.bincount(row, share, minlength=len(cliques))
     share *= p_known[row] / np.where(total > 0.0, total, 1.0)[row]
-    p_hop = np.array([life.p_hop for life in of_clique])
-    if config.returns:
-        others = np.bincount(row, np.where(np.arange(len(row)) == newest[row], 0.0, share), minlength=len(cliques))
-        p_other = others / np.maximum(1.0 - share[newest], TINY)  # of hops from the newest site, to another known one
-        absence = _absences(of_clique, p_hop, np.clip(1.0 - p_other, 0.0, 1.0))
-    else:
-        p_hop[:], share[:] = 0.0, 0.0
-        absence = tuple(life.absence for life in of_clique)
+    if not config.returns:
+        share[:] = 0.0
     return SiteDynamics(
         stay=tuple(life.stay for life in lives),
         since_s=sites.since_s,
-        absence=absence,
+        absence=tuple(life.absence for life in of_clique),
         away_since_s=seen,
-        p_hop=p_hop,
+        p_hop=np.array([life.p_hop for life in of_clique]) * float(config.returns),
         return_share=share,
         rhythm=living.lives.rhythm if config.learn_lifetimes else None,
         hourly=living.lives.follows(class_id),
     )
-
-
-def _absences(lives: list[Life], p_hop: FloatArray, p_unknown: FloatArray) -> tuple[LifetimePrior, ...]:
-    """Return how long what left its C sites is not at a known one: away, or at a place that is not known.
-
-    What stands there stays as long as at any other place, and is then moved again, with `p_hop` (C,), or is away: so a
-    door of which one position is known is back at it as soon as it has left the other. By the share (C,) of hops that
-    lead to unknown places.
-    """
-    left = p_hop * p_unknown
-    p_stands = p_hop * left / np.maximum(left + 1.0 - p_hop, TINY)
-    made: dict[tuple[int, float], LifetimePrior] = {}  # cliques of one class and as many sites have the same
-    found = []
-    for life, p in zip(lives, np.minimum(p_stands, 1.0).tolist(), strict=True):
-        key = (id(life), p)
-        if key not in made:
-            parts = [(life.stay, p), (life.absence, 1.0 - p)]
-            priors, shares = zip(*((prior, share) for prior, share in parts if share > 0.0), strict=True)
-            made[key] = priors[0] if len(priors) == 1 else Mixture.of(priors, shares)
-        found.append(made[key])
-    return tuple(found)
 
 
 def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
