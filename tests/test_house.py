@@ -35,7 +35,7 @@ OF_THE_CODE = frozenset(
     AGREE_RAD ANYWHERE_M BESIDE_RAD BURST_S CERTAIN_NATS CONTRADICTS_NATS FAR FARTHEST_M FAR_M FAR_OUT FEWEST
     FEWEST_BINS FEWEST_LOST FEWEST_NAMES FEWEST_NUMBERS FEWEST_OF_BOTH FEWEST_PAIRS FEWEST_PARTICLES FEWEST_POSES
     FEWEST_ROWS FEWEST_SIGHTINGS FLAT_M GATE GROSS_M GUESS_S HELD_M HELD_NATS IMPLIED_M2 LEAST LEAST_AGREE_M LEAST_FALL
-    LEAST_INFORMATION LEAST_LEFT
+    LEAST_INFORMATION LEAST_LEFT LEAST_RANGE_M
     LEAST_M2 LEAST_OF_SQUARE LEAST_P LEAST_SHARE LEAST_SIGMA LEAST_VARIANCE LEAST_WEIGHT LONGEST_S LOOSE_RAD LOST_M
     MOST_P NARROW_M NEAR NEAR_GAIN NEAR_NOISE NEAR_NOISE_GAIN NEAR_ROUND NEAR_S NO_JUMP_LOG_ODDS PERSIST_S REST_S
     RETRY_S SAME_M
@@ -193,6 +193,7 @@ SOLVE_BY_THEMSELVES = {
     "slam.space.starts": "Gauss-Newton of single poses from three points each, of thousands at once",
     "slam.space.drift": "two numbers of an odometry, by expectation-maximisation and reweighted",
     "slam.space.intake": "one point where rays meet, a landmark",
+    "slam.space.moved_within": "the two points where rays meet before and after a cut, reweighted",
     "maps.bodies": "Gauss-Newton of one rigid motion of a body",
     "maps.sessions.gaussian": "one similarity of a session over a map",
 }

@@ -250,8 +250,8 @@ def test_a_command_ends_with_130_and_what_was_kept(tmp_path: Path) -> None:
 def test_a_command_removes_what_is_half_written(tmp_path: Path) -> None:
     write = """
 from evermap.runs.folder import RunFolder
-from evermap.io.files import staged_folder
-with RunFolder("out") as folder, staged_folder("template") as staging:
+from evermap.io.files import stage_folder
+with RunFolder("out") as folder, stage_folder("template") as staging:
     folder.path("figures/map.png").write_text("half")
     (staging / "table.csv").write_text("half")
     """

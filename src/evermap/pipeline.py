@@ -166,9 +166,7 @@ def _conclude(case: _Case, **more: Any) -> tuple[SlamResult, SessionSolution[Vis
     if prior_map is not None:
         not_missed = [*case.doubled.tolist(), *case.left_out]  # what was read was not missed
         expected = prior_map[~np.isin(prior_map.landmark_id, not_missed)]
-        result = with_known_up(
-            session.looked_for(visit, result, expected, config.living, config.slam.changes.interval), prior_map.up
-        )
+        result = with_known_up(session.looked_for(visit, result, expected, config.living), prior_map.up)
     result = _judge(
         result, asked.inputs.recording, config, asked.inputs.prior_map, case.found, case.doubled,
         as_read=case.read, asked=asked,

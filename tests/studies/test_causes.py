@@ -220,26 +220,6 @@ def test_a_landmark_that_left_is_known_to_be_gone() -> None:
     assert compare_changes([moved], truth, case)[0] == [moved]
 
 
-@pytest.mark.parametrize("make", ["laser", pytest.param("stereo", marks=pytest.mark.slow)])
-def test_what_is_taken_away_while_the_robot_drives_is_reported_with_its_interval(make: str) -> None:
-    case = make_case(by_name(f"{make} in a map: two vanished at half time"), 3)
-    truth, result = true_changes(case), solve(case.given).result
-    assert result is not None
-    assert {one.landmark_ids[0] for one in result.changes} == set(truth)
-    assert len(result.changes) == len(truth) == 2
-    places, seen = result.landmarks, result.innovations
-    for change in result.changes:
-        name = change.landmark_ids[0]
-        assert change.kind is ChangeKind.VANISHED
-        assert change.probability > 0.7
-        assert change.stamp_from_s <= truth[name].at_s <= change.stamp_to_s
-        assert change.stamp_from_s >= seen.stamp_s[seen.landmark_id == name].max() - 1e-6
-        assert change.n_misses > 10
-        assert places.p_exists[places.landmark_id == name] == pytest.approx(1.0 - change.probability)
-    others = ~np.isin(places.landmark_id, list(truth))
-    assert (places.p_exists[others] > 0.95).all()
-
-
 def _row(**changes: object) -> dict[str, object]:
     return {
         "verdict": None, "exit": 0, "error_m": 0.01, "aligned_m": 0.01, "odometry_m": 0.1, "nees": 1.0, "bound_m": 0.02,

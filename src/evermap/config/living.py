@@ -173,7 +173,6 @@ class LooksConfig(Section):
     p_flanked_hidden: Share = rule(0.05, "probability that it is hidden from one position all the same")
     p_always_hidden: Share = rule(0.003, "probability that it is hidden from all")
     p_gone: Share = rule(0.03, "probability that a landmark of a given map is nowhere")
-    p_leaves: Share = rule(0.003, "probability that one that is there leaves while the robot drives")
 
 
 class DecisionConfig(Section):

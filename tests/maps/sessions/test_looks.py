@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evermap.config import LooksConfig
-from evermap.maps.sessions.looks import EXPECTED, Watch, find_departures, weigh_misses
+from evermap.maps.sessions.looks import Watch, weigh_misses
 from evermap.maps.sessions.spatial import find_looks
 from evermap.sensing.visibility import LooksAt
 from evermap.types import BoolArray, FloatArray
@@ -136,89 +136,3 @@ def test_a_few_views_tell_no_beat() -> None:
     seen[40:, 1] = False
     assert seen[:, 1].sum() <= 20
     np.testing.assert_array_equal(find_looks(stamp_s, seen, RULES)[:, 1], seen[:, 1])
-
-
-LAPS, STATIONS = 6, 12
-
-
-def on_laps(
-    missed: dict[int, list[tuple[int, int]]], *, beyond: bool = False, laps: int = LAPS, n_places: int = 8
-) -> Watch:
-    """A robot on a ring of stations, 3 m apart, round after round, three frames each: all places are looked at from
-    everywhere, and detected but for `missed`, from a look to another one, by place. With `beyond` the last round is
-    elsewhere.
-    """
-    count = 3 * STATIONS
-    turn = 2.0 * np.pi * np.repeat(np.arange(STATIONS), 3) / STATIONS
-    ring = 3.0 / (2.0 * np.sin(np.pi / STATIONS)) * np.column_stack([np.cos(turn), np.sin(turn)])
-    eye = np.column_stack([np.tile(ring, (laps, 1)), np.zeros(laps * count)])
-    if beyond:
-        eye[-count:, 0] += 2.0 * RULES.near_m
-    look, place = (part.ravel() for part in np.meshgrid(np.arange(len(eye)), np.arange(n_places), indexing="ij"))
-    hit = np.ones(len(look), dtype=np.bool_)
-    for row, ranges in missed.items():
-        for first, last in ranges:
-            hit &= ~((place == row) & (look >= first) & (look < last))
-    return Watch(0.5 * np.arange(len(eye)), LooksAt(look, place, np.full(len(look), P_DETECT), hit), eye)
-
-
-END = LAPS * 3 * STATIONS
-
-
-def test_what_is_missed_from_where_it_was_seen_has_left_in_between() -> None:
-    """The last detection is at 74.5 s, and three looks later it is known to be gone."""
-    asked = np.arange(8) < 7
-    (left,) = find_departures(on_laps({2: [(150, END)], 7: [(150, END)]}), asked, 0.95)  # the eighth is not asked
-    hits = 7 * END - (END - 150) - 7  # detections that another one follows
-    often = 0.5 / (1.0 + hits / RULES.sticky)  # never missed by so many looks so far
-    stands = often * (1.0 - RULES.p_leaves)
-    assert left.place == 2
-    assert left.p_stands == pytest.approx(stands / (stands + RULES.p_leaves), rel=1e-9)
-    assert left.n_misses == END - 150
-    assert left.between_s[0] == 74.5
-    assert 75.0 <= left.between_s[1] <= 76.5
-
-
-@pytest.mark.parametrize(
-    ("missed", "beyond"),
-    [
-        pytest.param([], False, id="seen until the end"),
-        pytest.param([(150, END - 1)], False, id="seen again"),
-        pytest.param([(END - 36, END)], True, id="missed from elsewhere"),
-        pytest.param([(END - 3, END)], False, id="missed from one position, behind what may stand there"),
-        pytest.param([(0, END)], False, id="never seen"),
-    ],
-)
-def test_what_is_not_missed_from_where_it_was_seen_has_not_left(missed: list[tuple[int, int]], *, beyond: bool) -> None:
-    assert not find_departures(on_laps({2: missed}, beyond=beyond), np.ones(8, dtype=np.bool_), 0.95)
-
-
-def test_what_is_missed_as_long_as_others_that_are_seen_again_has_not_left() -> None:
-    """The same end without such gaps of others is a departure."""
-    end, gaps = [(END - 24, END)], [(40, 76)]
-    assert [one.place for one in find_departures(on_laps({2: end}), np.ones(8, dtype=np.bool_), 0.95)] == [2]
-    others = {2: end, **dict.fromkeys(range(3, 8), gaps)}
-    assert not find_departures(on_laps(others), np.ones(8, dtype=np.bool_), 0.95)
-
-
-def test_a_landmark_that_is_seldom_detected_has_not_left_where_it_is_missed() -> None:
-    """One of ten looks sees it: as many misses in the end as in between."""
-    rare = [(k + 1, k + 10) for k in range(0, END, 10)]
-    watch = on_laps({2: rare, 3: [(END - 9, END)]})
-    assert [one.place for one in find_departures(watch, np.ones(8, dtype=np.bool_), 0.95)] == [3]
-    assert EXPECTED > 0.1 * 9
-
-
-def test_the_interval_of_a_departure_holds_the_looks_that_may_have_missed_it() -> None:
-    """By the ratio of likelihoods: a less probable detection is a longer interval."""
-    watch = on_laps({2: [(150, END)]})
-    asked = np.ones(8, dtype=np.bool_)
-    wide = watch._replace(listed=watch.listed._replace(p_detect=np.full(len(watch.listed.pose), 0.6)))
-    (sharp,), (blurred,) = find_departures(watch, asked, 0.95), find_departures(wide, asked, 0.95)
-    (half,) = find_departures(wide, asked, 0.5)
-    p_look = 1.0 - (1.0 - 0.6) ** (1.0 / RULES.sticky)
-    ratio = RULES.p_flanked_hidden + (1.0 - RULES.p_flanked_hidden) * (1.0 - p_look)
-    looks = np.ceil(np.log(0.025) / np.log(ratio))  # of a geometric sequence
-    assert blurred.between_s == (74.5, 74.5 + 0.5 * looks)
-    assert sharp.between_s[1] < blurred.between_s[1]
-    assert half.between_s[1] < blurred.between_s[1]

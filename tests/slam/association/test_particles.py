@@ -14,7 +14,7 @@ from evermap.config import Config
 from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.features import Traits
-from evermap.slam.association.identify import search_changes
+from evermap.slam.association.identify import search_assignment
 from evermap.slam.association.in_plane import PlanarAssociator
 from evermap.slam.association.particles import drawn
 from evermap.slam.calibration import CalibrationPrior
@@ -97,7 +97,7 @@ def test_who_was_exchanged_is_told_apart_again(seed: int) -> None:
     before = identity_scores(wrong.landmark_row, true).purity
     purity = [identity_scores(drawn(wrong, odometry, k)[0].landmark_row, true).purity for k in range(3)]
     assert before < 0.97 < max(purity)
-    again = search_changes(associator, wrong, lambda _: wrong)
+    again = search_assignment(associator, wrong, lambda _: wrong)
     assert associator.against(again) < associator.against(found) + 1.0
     assert identity_scores(again.landmark_row, true).purity == 1.0
     assert np.mean(again.landmark_row == NOBODY) < 0.02

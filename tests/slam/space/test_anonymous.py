@@ -109,9 +109,9 @@ def test_rejected_trials_in_space_change_nothing(monkeypatch):
 
     with monkeypatch.context() as no:
         no.setattr("evermap.slam.association.associator.find_most_rise", rejected)
-        assert associator._merged(solved) is solved
+        assert associator._merge_duplicates(solved) is solved
     assert trials
-    assert len(associator._merged(solved).estimate.place) == len(found.estimate.place)
+    assert len(associator._merge_duplicates(solved).estimate.place) == len(found.estimate.place)
     associator.against(solved)
     associator.finish(solved)
     associator.finish()

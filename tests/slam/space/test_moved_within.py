@@ -129,7 +129,7 @@ def test_a_landmark_of_which_only_directions_are_seen_is_moved(move, mapped):
     check_moves(world, as_directions(world, 4), (move,), mapped=mapped)
 
 
-@pytest.mark.parametrize(("strays", "cut"), [(0, 30), (4, 30), (0, 18), (0, 60)])
+@pytest.mark.parametrize(("strays", "cut"), [(0, 30), (4, 30), (0, 60)])
 def test_directions_part_where_they_meet_at_two_points(strays, cut):
     """Exact directions with a milliradian of noise from a curve; some stray far off; none part at one point."""
     random = np.random.default_rng(7)
@@ -147,10 +147,8 @@ def test_directions_part_where_they_meet_at_two_points(strays, cut):
         return
     assert parted is not None
     assert parted[0] == cut
-    assert np.array(parted[1:]) == pytest.approx(both_m, abs=0.01)
-    assert (
-        moved_within._part_rays(eye_m[cut - 3 : cut + 2], ahead[cut - 3 : cut + 2], np.full(5, 1e-3), 3) is None
-    )  # too few
+    assert np.array(parted[1:]) == pytest.approx(both_m, abs=0.004)
+    assert moved_within._part_rays(eye_m[27:32], ahead[27:32], np.full(5, 1e-3), 3) is None  # too few
 
 
 @pytest.mark.slow

@@ -23,18 +23,16 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import betaln
 
 from evermap.config import LivingConfig, LooksConfig, SightConfig
 from evermap.existence.sites import SiteLooks
 from evermap.geometry import se2
-from evermap.maps.living import EXISTS, LivingMap, class_of, clique_rows, site_middles
+from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
 from evermap.maps.sessions.extend import first_and_last
 from evermap.maps.sessions.open_space import NewLooks, OpenSpace, Rays, count_sides, weigh_new_lines
 from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets, session_rate
 from evermap.sensing.visibility import LooksAt, NominalField
-from evermap.slam.changes.explain import find_instant
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL, LIVING = LooksConfig(), LivingConfig()
@@ -92,22 +90,6 @@ class Watch(NamedTuple):
         listed = NominalField(sensor, settings).looks(sighting.pose_map_robot, position_m, seen)
         eye = se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor))
         return cls(sighting.stamp_s, listed, eye)
-
-
-class Departure(NamedTuple):
-    """What left a place while the robot drove.
-
-    Attributes:
-        place: row of the map's places.
-        p_stands: probability that it is there all the same.
-        n_misses: looks that missed it afterwards.
-        between_s: it left between these two stamps.
-    """
-
-    place: int
-    p_stands: float
-    n_misses: int
-    between_s: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -578,82 +560,13 @@ def _misses_between_others(
         gap = np.diff(np.append(around, around[0] + 2.0 * np.pi)).max()
         if not oriented[place] and 2.0 * np.pi - gap < settings.one_sided_rad:
             continue  # it may be seen from another side only
-        each = _p_of_misses(eye[listed.pose[rows], :2], listed.p_detect[rows], settings)
-        p_missed[place] = max(each, settings.p_always_hidden)
+        position = np.floor(eye[listed.pose[rows], :2] / settings.elsewhere_m)
+        cell = np.unique(position, axis=0, return_inverse=True)[1].ravel()
+        expected = np.bincount(cell, listed.p_detect[rows])
+        log_missed = np.bincount(cell, np.log1p(-np.minimum(listed.p_detect[rows], 0.99)))[expected >= EXPECTED]
+        each = settings.p_flanked_hidden + (1.0 - settings.p_flanked_hidden) * np.exp(log_missed)
+        p_missed[place] = max(float(np.prod(each)), settings.p_always_hidden)
     return flanked, p_missed
-
-
-def _p_of_misses(eye_m: FloatArray, p_detect: FloatArray, settings: LooksConfig) -> float:
-    """Return how probable misses (K,) from positions (K, 2) are, if something stands there: it may be hidden from some
-    of them.
-    """
-    position = np.floor(eye_m / settings.elsewhere_m)
-    cell = np.unique(position, axis=0, return_inverse=True)[1].ravel()
-    expected = np.bincount(cell, p_detect)
-    log_missed = np.bincount(cell, np.log1p(-np.minimum(p_detect, 0.99)))[expected >= EXPECTED]
-    return float(np.prod(settings.p_flanked_hidden + (1.0 - settings.p_flanked_hidden) * np.exp(log_missed)))
-
-
-def find_departures(watch: Watch, asked: BoolArray, interval: float, settings: LooksConfig = USUAL) -> list[Departure]:
-    """Return places that are not believed to hold anything any more, though something was detected there: the looks
-    after the last detection missed it along lines along which it was seen before.
-
-    How often such looks miss what stands there is learned, too: between two detections of one place it stood.
-
-    Args:
-        watch: looks of a session.
-        asked: (P,) which places are asked.
-        interval: probability of the interval in which it left.
-        settings: what counts.
-    """
-    ends = {place: gaps for place in np.flatnonzero(asked).tolist() if (gaps := _find_gaps(watch, place, settings))}
-    between = np.concatenate([np.zeros(0), *(p_missed[:-1] for p_missed, _ in ends.values())])
-    found = list[Departure]()
-    for place, (p_missed, missed) in ends.items():
-        often = (0.5 + np.count_nonzero(between <= p_missed[-1])) / (1.0 + len(between) / settings.sticky)
-        stands = (1.0 - settings.p_leaves) * max(float(p_missed[-1]), min(often, 1.0))
-        p_stands = stands / (stands + settings.p_leaves)
-        if p_stands < EXISTS:
-            hidden, when_s = settings.p_flanked_hidden, missed.stamp_s
-            gain = np.append(0.0, -np.log(hidden + (1.0 - hidden) * (1.0 - missed.p_detect)))
-            _, (low, high) = find_instant(gain, when_s, interval)
-            found.append(Departure(place, p_stands, len(gain) - 1, (float(when_s[low]), float(when_s[high]))))
-    return found
-
-
-class _Missed(NamedTuple):
-    """Looks (K,) at a place that missed it, after a detection, the first of (K + 1,) stamps; and how probable a
-    detection was.
-    """
-
-    stamp_s: FloatArray
-    p_detect: FloatArray
-
-
-def _find_gaps(watch: Watch, place: int, settings: LooksConfig) -> tuple[FloatArray, _Missed] | None:
-    """Return (H,) how probable it is that all looks after each detection of a place, until the next one, miss it if it
-    stands there, and the last of them; looks are from near where it was detected before. None if it never was.
-    """
-    listed = watch.listed
-    mine = np.flatnonzero(listed.landmark == place)
-    mine = mine[np.argsort(watch.stamp_s[listed.pose[mine]], kind="stable")]
-    stamp_s, eye_m = watch.stamp_s[listed.pose[mine]], watch.eye[listed.pose[mine], :2]
-    hits = np.flatnonzero(listed.hit[mine])
-    if not len(hits):
-        return None
-    clear = cKDTree(eye_m[hits]).query(eye_m[: hits[-1] + 1])[0] <= settings.near_m
-    rate = len(hits) / (np.count_nonzero(clear) + 1.0)
-    p_detect = 1.0 - (1.0 - np.minimum(listed.p_detect[mine], rate)) ** (1.0 / settings.sticky)
-    until = np.append(hits[1:], len(mine))
-    total = np.append(0.0, np.cumsum(p_detect))
-    p_missed, missed = np.ones(len(hits)), np.zeros(0, dtype=np.int64)
-    for gap in np.flatnonzero(total[until] - total[hits + 1] >= EXPECTED).tolist():
-        missed = np.arange(hits[gap] + 1, until[gap])
-        missed = missed[cKDTree(eye_m[hits[: gap + 1]]).query(eye_m[missed])[0] <= settings.near_m]
-        if len(missed):
-            p_missed[gap] = _p_of_misses(eye_m[missed], p_detect[missed], settings)
-    missed = missed[missed > hits[-1]]
-    return p_missed, _Missed(stamp_s[np.append(hits[-1], missed)], p_detect[missed])
 
 
 def _misses_in_the_open(

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from evermap.config import LivingConfig, LooksConfig
+from evermap.config import LivingConfig
 from evermap.existence.sites import Evidence
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
@@ -23,7 +23,6 @@ from evermap.maps.sessions.looks import (
     Sighting,
     Watch,
     arrivals,
-    find_departures,
     looked_at,
     weigh_misses,
 )
@@ -39,7 +38,6 @@ from evermap.types import (
     AnyRecording,
     ChangeKind,
     FloatArray,
-    IntArray,
     Landmarks,
     MapChange,
     Misses,
@@ -300,18 +298,15 @@ def add_existence(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamR
     return replace(slam, landmarks=mapped, misses=list_misses(living, now.sites.p_here, seen, visit))
 
 
-def looked_for(
-    visit: Visit, slam: SlamResult, given: Landmarks, config: LivingConfig, interval: float = 0.95
-) -> SlamResult:
+def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingConfig) -> SlamResult:
     """Return the result of a recording in a given map with the entries of that which were never detected: the looks
     that missed them; and those that are not believed to be there among `gone`, and as changes that are told.
 
-    What was detected is where the result has it; the beliefs about it stay as they are, but of what left its place
-    while the robot drove, between two stamps that hold the instant with probability `interval`.
+    What was detected is where the result has it; the beliefs about it stay as they are.
     """
     found = slam.landmarks
     unseen = given[~np.isin(given.landmark_id, found.landmark_id)]
-    if slam.trajectory.frame != "prior_map" or found.position_m.shape != (
+    if slam.trajectory.frame != "prior_map" or not len(unseen) or found.position_m.shape != (
         len(found), given.position_m.shape[1]
     ):  # fmt: skip
         return slam
@@ -347,9 +342,8 @@ def looked_for(
     every = rows_of(every, np.lexsort((every.landmark_id, every.frame)))
     unseen = replace(unseen, p_exists=p_exists, n_misses=np.bincount(which, minlength=len(names))[row])
     gone = replace(unseen[p_exists < EXISTS], frame=found.frame)
-    slam = _with_departures(replace(slam, misses=every), watch, names, given, config.looks, interval)
     if not len(gone):
-        return slam
+        return replace(slam, misses=every)
     nowhere = (math.nan,) * given.position_m.shape[1]
     told = tuple(
         MapChange((identity,), ChangeKind.VANISHED, math.nan, visit.span_s[0], nowhere, 0.0, 1.0 - p, 0, misses).named(
@@ -359,25 +353,7 @@ def looked_for(
             gone.landmark_id.tolist(), gone.p_exists.tolist(), gone.n_misses.tolist(), strict=True
         )
     )
-    return replace(slam, gone=gone, changes=(*slam.changes, *told))
-
-
-def _with_departures(
-    slam: SlamResult, watch: Watch, names: IntArray, given: Landmarks, looks: LooksConfig, interval: float
-) -> SlamResult:
-    """Return the result with what of a `given` map left its place while the robot drove, by looks at landmarks (P,)."""
-    elsewhere = [one for change in slam.changes for one in change.landmark_ids]
-    asked = np.isin(names, given.landmark_id) & np.isin(names, slam.landmarks.landmark_id) & ~np.isin(names, elsewhere)
-    p_exists, told = slam.landmarks.p_exists.copy(), list[MapChange]()
-    nowhere = (math.nan,) * given.position_m.shape[1]
-    for left in find_departures(watch, asked, interval, looks):
-        name = int(names[left.place])
-        p_exists[slam.landmarks.landmark_id == name] = left.p_stands
-        change = MapChange(
-            (name,), ChangeKind.VANISHED, *left.between_s, nowhere, 0.0, 1.0 - left.p_stands, 0, left.n_misses
-        )
-        told.append(change.named(slam.landmarks.names))
-    return replace(slam, landmarks=replace(slam.landmarks, p_exists=p_exists), changes=(*slam.changes, *told))
+    return replace(slam, misses=every, gone=gone, changes=(*slam.changes, *told))
 
 
 def judge_so_far(

@@ -299,15 +299,6 @@ def _causes() -> list[World]:
         quick="laser+",
     )
     some.add(
-        "laser uwb stereo beacons",
-        "two vanished at half time",
-        "change",
-        wrong.identities_stay,
-        wrong.vanishes(2, 0.5),
-        maps=MAP,
-        seeds=5,
-    )
-    some.add(
         "laser corners poses",
         "two exchanged before",
         "change",
