@@ -48,7 +48,7 @@ def recorded() -> tuple[Recording, Landmarks]:
 
 
 @cache
-def solved(*, in_map: bool = False) -> SlamResult:
+def solve_recorded(*, in_map: bool = False) -> SlamResult:
     """The run of that recording, which tests change by copies."""
     recording, survey = recorded()
     return run_slam(recording, prior_map=survey if in_map else None)
@@ -93,7 +93,7 @@ def test_a_cause_that_another_may_hold_instead_of_is_weak_and_names_both() -> No
 def test_a_scale_that_another_cause_may_be_is_no_suspicion() -> None:
     """What is said of it is which of the two it may be, and what decides."""
     recording, survey = recorded()
-    result = solved(in_map=True)
+    result = solve_recorded(in_map=True)
     slope = next(one for one in result.parameters if one.name == "range_slope")
     far = replace(slope, value=0.03, fixed=False, prior_mean=0.0, prior_sigma=0.0002)
     others = tuple(one for one in result.parameters if one.name != "range_slope")
@@ -124,7 +124,7 @@ def test_one_of_two_mistakes_makes_a_run_unusable_whichever_it_is() -> None:
 
 def test_of_ranges_alone_the_side_of_the_sensor_shows_the_sign_of_turns() -> None:
     recording, survey = recorded()
-    result = solved()
+    result = solve_recorded()
     assert np.isnan(measure_signs(result, recording).hand)  # bearings show it
     seen = replace(recording.detections, bearing_rad=np.full(len(recording.detections), np.nan))
     # one drive in a thousand has the wrong sign beforehand, and with -2.3 nats one in a hundred
@@ -169,7 +169,7 @@ def test_every_cause_is_told_once() -> None:
 
 def test_a_solution_that_is_no_number_is_lost() -> None:
     recording, _ = recorded()
-    result = solved()
+    result = solve_recorded()
     pose = result.trajectory.pose_world_robot.copy()
     pose[3] = np.nan
     signs = measure_signs(replace(result, trajectory=replace(result.trajectory, pose_world_robot=pose)), recording)
@@ -179,7 +179,7 @@ def test_a_solution_that_is_no_number_is_lost() -> None:
 
 def test_an_association_that_is_worse_than_odometry_alone_is_lost() -> None:
     recording, _ = recorded()
-    result = solved()
+    result = solve_recorded()
     for evidence, kind in (
         (AssociationEvidence(0.1, 12, 30, 18, 20.0, 200.0), VerdictKind.SOUND),
         (AssociationEvidence(0.5, 12, 30, 18, 20.0, 200.0), VerdictKind.LOST),
@@ -232,7 +232,7 @@ def test_a_scale_far_from_what_is_stated_is_weak_until_a_map_says_which_is_right
     recording, survey = recorded()
     scale = ParameterEstimate("odometry_scale", 0.984, 0.002, 1.0, 0.005, "")
     for given, expected in ((None, True), (survey, False)):
-        result = solved(in_map=given is not None)
+        result = solve_recorded(in_map=given is not None)
         other = replace(result, parameters=(*result.parameters, scale))
         assert ("stated-scale" in alarms(other, recording, given)) is expected
         assert "stated-scale" not in alarms(result, recording, given)
@@ -240,7 +240,7 @@ def test_a_scale_far_from_what_is_stated_is_weak_until_a_map_says_which_is_right
 
 def test_a_delay_is_weak_where_it_may_be_the_sensors() -> None:
     recording, survey = recorded()
-    result = solved(in_map=True)
+    result = solve_recorded(in_map=True)
     late = (0.3, 0.001, True), (0.145, 0.01, True), (0.135, 0.01, False), (0.2, 0.15, False)
     # nothing is stamped before it happened; but of a delay that nobody knows nothing follows
     early = (-0.3, 0.001, True), (-0.12, 0.001, True), (-0.04, 0.001, False), (-0.06, 0.02, False)
@@ -257,7 +257,7 @@ def test_a_delay_is_weak_where_it_may_be_the_sensors() -> None:
 
 def test_a_solution_that_scatters_detections_more_than_odometry_does_is_lost() -> None:
     recording, _ = recorded()
-    result = solved()
+    result = solve_recorded()
     assert measure_signs(result, recording).over_odometry < 1.0
     pose = result.trajectory.pose_world_robot.copy()
     pose[:, 0] *= 0.5  # halves every way along x
@@ -268,7 +268,7 @@ def test_a_solution_that_scatters_detections_more_than_odometry_does_is_lost() -
 
 def test_a_landmark_unexplained_for_long_is_weak_unless_its_change_is_reported() -> None:
     recording, _ = recorded()
-    result = solved()
+    result = solve_recorded()
     innovations = result.innovations
     mine = np.flatnonzero(innovations.landmark_id == innovations.landmark_id[0])
     order = mine[np.argsort(innovations.stamp_s[mine])]
@@ -284,7 +284,7 @@ def test_a_landmark_unexplained_for_long_is_weak_unless_its_change_is_reported()
 
 def test_noise_far_beyond_what_is_usual_is_weak() -> None:
     recording, _ = recorded()
-    result = solved()
+    result = solve_recorded()
     assert not alarms(result, recording)
     for name, code, most in (
         ("sigma_bearing_rad", "noise-of-detections", 4.0),

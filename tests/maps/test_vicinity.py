@@ -37,7 +37,7 @@ def recordings() -> tuple[Recording, ...]:
 
 
 @functools.cache
-def lived(*, large: bool, days: int = 2) -> tuple[em.Session, ...]:
+def live_days(*, large: bool, days: int = 2) -> tuple[em.Session, ...]:
     sessions: list[em.Session] = []
     settings = config(**SMALL) if large else config()
     for recording in recordings()[:days]:
@@ -49,7 +49,7 @@ def lived(*, large: bool, days: int = 2) -> tuple[em.Session, ...]:
 @pytest.mark.slow
 def test_the_same_changes_are_told_of_a_large_map() -> None:
     n_dated = 0
-    for small, large in zip(lived(large=False, days=4), lived(large=True, days=4), strict=True):
+    for small, large in zip(live_days(large=False, days=4), live_days(large=True, days=4), strict=True):
         assert isinstance(large.living.covariance_m2, ChunkedCovariance)
         assert [(c.kind, c.landmark_ids) for c in large.changes] == [(c.kind, c.landmark_ids) for c in small.changes]
         for own, other in zip(large.changes, small.changes, strict=True):
@@ -57,12 +57,12 @@ def test_the_same_changes_are_told_of_a_large_map() -> None:
         np.testing.assert_array_equal(large.living.members.landmark_id, small.living.members.landmark_id)
         np.testing.assert_allclose(large.living.p_exists(), small.living.p_exists(), atol=0.02)
         n_dated += len(large.living.dated)
-    assert sum(len(session.changes) for session in lived(large=False, days=4)) >= 8
+    assert sum(len(session.changes) for session in live_days(large=False, days=4)) >= 8
     assert n_dated > 0  # some sites were too far from a patrol to be touched
 
 
 def test_a_part_that_nothing_happened_to_is_put_back_as_it_was() -> None:
-    living = lived(large=True)[-1].living
+    living = live_days(large=True)[-1].living
     some = np.unique(living.members.clique_id)[::3]
     vicinity = Vicinity.of(living, some, em.Config().living, np.array([0.0, 0.0, 8.0, 8.0]))
     assert 0 < len(vicinity.part.places) < len(living.places)
@@ -87,7 +87,7 @@ def test_a_part_that_nothing_happened_to_is_put_back_as_it_was() -> None:
 
 
 def test_a_part_of_which_looks_alone_are_told_keeps_the_covariance_of_the_map() -> None:
-    living = lived(large=True)[-1].living
+    living = live_days(large=True)[-1].living
     some = np.unique(living.members.clique_id)[::3]
     vicinity = Vicinity.of(living, some, em.Config().living, jointly=False)
     assert not isinstance(vicinity.part.covariance_m2, ChunkedCovariance)
@@ -102,7 +102,7 @@ def test_a_part_of_which_looks_alone_are_told_keeps_the_covariance_of_the_map() 
 
 
 def test_beliefs_age_from_when_somebody_was_near() -> None:
-    living = lived(large=False)[-1].living
+    living = live_days(large=False)[-1].living
     later_s = living.stamp_s + 86_400.0
     aged = living.p_exists(later_s)
     sites = living.sites.site_id
@@ -116,7 +116,7 @@ def test_beliefs_age_from_when_somebody_was_near() -> None:
 
 
 def test_localisation_in_chunks_is_as_in_the_dense_map() -> None:
-    living = lived(large=False)[-1].living
+    living = live_days(large=False)[-1].living
     recording = recordings()[-1]
     dense = em.run_localization(recording, living)
     chunked = em.run_localization(recording, in_chunks(living, config(**SMALL).living))

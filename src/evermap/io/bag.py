@@ -161,7 +161,7 @@ def read_bag(path: str | Path, robot: int | None = None, topics: str | Path | No
     settings = guess_settings(content)
     if topics is None and not stated.is_file():
         return _recording(path, content, settings, guessed=True)
-    return _recording(path, content, state_settings(stated, content, settings), guessed=False)
+    return _recording(path, content, read_settings(stated, content, settings), guessed=False)
 
 
 def bag_settings(path: str | Path) -> str:
@@ -263,7 +263,7 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
     return BagSensor(topic, frame, camera if pixels else "", rectified and pixels, identity)
 
 
-def state_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
+def read_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
     """Return the settings in a file; what is missing is as guessed.
 
     `whole`: topics that the content lacks are errors; else they may come yet.

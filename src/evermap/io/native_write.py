@@ -167,22 +167,22 @@ def native_tables(recording: Recording | SpatialRecording) -> dict[str, dict[str
         tables["detections"] |= _keep_known(_columns(detections, "sigma_range_m", "sigma_bearing_rad"))
     tables["frames"] = {"stamp_s": recording.frames.stamp_s}
     if recording.truth is not None:
-        tables["truth"] = _write_poses(recording.truth)
+        tables["truth"] = _pose_columns(recording.truth)
     if recording.true_landmarks is not None:
         tables["landmarks"] = _survey(recording.true_landmarks, called, names)
     if recording.robot_sightings is not None:
         tables["robot_sightings"] = _columns(recording.robot_sightings, "stamp_s", "robot_id", "range_m", "bearing_rad")
     if len(recording.objects):
-        landmark_id = _write_names(recording.objects[:, 0], called)
+        landmark_id = _label_ids(recording.objects[:, 0], called)
         tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}
     for table in recording.measurements:
         columns = measurement_columns(table)
-        place = {"landmark_id": _write_names(table.landmark_id, called)} if "landmark_id" in columns else {}
+        place = {"landmark_id": _label_ids(table.landmark_id, called)} if "landmark_id" in columns else {}
         tables[table.kind] = _keep_known({**columns, **place})
     return tables
 
 
-def _write_poses(path: Trajectory | SpatialOdometry) -> dict[str, FloatArray]:
+def _pose_columns(path: Trajectory | SpatialOdometry) -> dict[str, FloatArray]:
     pose = path.pose_world_robot
     names = (*AT, *QUATERNION) if pose.shape[1] == 7 else ("x_m", "y_m", "theta_rad")
     return {"stamp_s": path.stamp_s, **dict(zip(names, pose.T, strict=True))}
@@ -195,12 +195,12 @@ def _columns(table: Any, *names: str) -> dict[str, FloatArray]:
 def _odometry(odometry: Odometry | SpatialOdometry) -> dict[str, FloatArray]:
     if isinstance(odometry, Odometry):
         return _columns(odometry, "stamp_s", "forward_mps", "lateral_mps", "angular_radps")
-    return {**_write_poses(odometry), **_keep_known(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
+    return {**_pose_columns(odometry), **_keep_known(dict(zip(VARIANCES, odometry.variance.T, strict=True)))}
 
 
 def _in_plane(recording: Recording) -> dict[str, Any]:
     detections = recording.detections
-    landmark_id = _write_names(detections.landmark_id, recording.landmark_names)
+    landmark_id = _label_ids(detections.landmark_id, recording.landmark_names)
     return {"landmark_id": landmark_id, **_columns(detections, "range_m", "bearing_rad")}
 
 
@@ -218,7 +218,7 @@ def _in_space(recording: SpatialRecording) -> dict[str, Any]:
     }
     return {
         "sensor": [sensors[row] for row in detections.sensor.tolist()],
-        "landmark_id": _write_names(detections.landmark_id, recording.landmark_names),
+        "landmark_id": _label_ids(detections.landmark_id, recording.landmark_names),
         **dict(zip(AT, detections.position_sensor_m.T, strict=True)),
         **_keep_known(details),
     }
@@ -231,13 +231,13 @@ def _keep_known(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
 
 def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[str, ...]) -> dict[str, Any]:
     columns = survey_columns(landmarks)
-    columns["landmark_id"] = _write_names(landmarks.landmark_id, {**names, **landmarks.names})
+    columns["landmark_id"] = _label_ids(landmarks.landmark_id, {**names, **landmarks.names})
     if np.any(landmarks.class_id != UNKNOWN):
         columns["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or class_names)
     return columns
 
 
-def _write_names(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
+def _label_ids(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     """Return a column of ids: as numbers, or as text if any id is one; other names would be read as other ids."""
     if not any(is_text_of(names[one], one) for one in {*landmark_id.tolist()} & names.keys()):
         return landmark_id

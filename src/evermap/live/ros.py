@@ -19,7 +19,7 @@ import numpy as np
 
 from evermap.errors import EvermapError, InputError
 from evermap.geometry import se2, se3
-from evermap.io.bag import BagSettings, detections_of, guess_settings, mount_sensor, stamps_of, state_settings
+from evermap.io.bag import BagSettings, detections_of, guess_settings, mount_sensor, read_settings, stamps_of
 from evermap.io.bag_messages import OBJECT_FIELDS, POSES, BagContent, SeenColumns, handler_of, objects_in_space
 from evermap.io.cdr import parts_of
 from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
@@ -90,7 +90,7 @@ class Listener:
         """Chosen topics, once they are known."""
         if stated is not None:
             guessed = guess_settings(self._content)
-            self.settings = state_settings(stated, self._content, guessed, whole=False)
+            self.settings = read_settings(stated, self._content, guessed, whole=False)
             self._tell_settings("as stated")
 
     @property

@@ -85,7 +85,7 @@ class BaseLocalizer(Shown, ABC):
         self._log_p = np.log(np.maximum(places.p_here, settings.least_belief))
         self._believed = self._log_p.copy()
         self._stamp_s: float | None = None
-        self._list_agreeing: dict[int, tuple[float, bool]] = {}
+        self._agreed: dict[int, tuple[float, bool]] = {}
         self.learn = learn
         """Whether landmarks that the map lacks are used."""
         self._new: dict[int, int] = {}
@@ -221,7 +221,7 @@ class BaseLocalizer(Shown, ABC):
         agreement, places, by = self._track.agreement, self.places, self._settings.better_by
         if self._is_placed and agreement(placed.pose, places) < by * agreement(self._filter.pose, places):
             self._track = None  # it is the world that differs from the map
-            self._list_agreeing.clear()
+            self._agreed.clear()
             return
         self._place_at(placed)
 
@@ -242,7 +242,7 @@ class BaseLocalizer(Shown, ABC):
         covariance[:pose_dim, :pose_dim] = placed.covariance + follows[:, at] @ placed.by_places.T
         self._believed = self._log_p.copy()
         self._track = None
-        self._list_agreeing.clear()
+        self._agreed.clear()
 
     def _update(
         self, stamp_s: float, first: IntArray, last: IntArray, seen: Any, used: IntArray, new: IntArray
@@ -293,11 +293,11 @@ class BaseLocalizer(Shown, ABC):
         """Lost where most of the landmarks compared last were not where they should have been."""
         settings = self._settings
         for name, good in zip(landmark_id.tolist(), agrees.tolist(), strict=True):
-            self._list_agreeing.pop(name, None)
-            self._list_agreeing[name] = (stamp_s, good)
-        while len(self._list_agreeing) > max(settings.remembered, len(landmark_id)):
-            self._list_agreeing.pop(next(iter(self._list_agreeing)))
-        fresh = [good for seen_s, good in self._list_agreeing.values() if seen_s >= stamp_s - settings.memory_s]
+            self._agreed.pop(name, None)
+            self._agreed[name] = (stamp_s, good)
+        while len(self._agreed) > max(settings.remembered, len(landmark_id)):
+            self._agreed.pop(next(iter(self._agreed)))
+        fresh = [good for seen_s, good in self._agreed.values() if seen_s >= stamp_s - settings.memory_s]
         lost = len(fresh) >= settings.least_remembered and 2 * sum(fresh) < len(fresh)
         if lost and self._track is None:
             self._track = self._begin_track()

@@ -439,24 +439,24 @@ class Marginals:
     def __init__(
         self, solved: Factorised, n_poses: int, n_detections: int, known: BoolArray, *, block: Block | None = None
     ) -> None:
-        self._solve_assignment, self._n, self._m, self.known = solved, n_poses, n_detections, known
+        self._solved, self._n, self._m, self.known = solved, n_poses, n_detections, known
         n_known = int(known.sum())
         alone = Block(0, n_poses + np.arange(n_known), n_poses + n_known, 0, n_poses - 1, n_poses - 1)
         self._block = alone if block is None else block
 
     def of(self, block: Block, n_poses: int, n_detections: int, known: BoolArray) -> Marginals:
         """Return those of another block of the same equations."""
-        other = Marginals(self._solve_assignment, n_poses, n_detections, known, block=block)
+        other = Marginals(self._solved, n_poses, n_detections, known, block=block)
         other._held = self._held
         return other
 
     def in_slices(self) -> Slices[None]:
         """Compute all that the factorised equations hold, in slices."""
-        self._held = yield from self._solve_assignment.spread(self._block.n_pairs)
+        self._held = yield from self._solved.spread(self._block.n_pairs)
 
     @cached_property
     def _held(self) -> Spread:
-        return exhaust(self._solve_assignment.spread(self._block.n_pairs))
+        return exhaust(self._solved.spread(self._block.n_pairs))
 
     @property
     def pose(self) -> FloatArray:
@@ -480,14 +480,14 @@ class Marginals:
     @cached_property
     def states(self) -> FloatArray:
         """(11, 11) covariance of the calibration states."""
-        tree = self._solve_assignment.system.tree
+        tree = self._solved.system.tree
         at = tree.in_border[self._block.border] + np.arange(N_STATES)
-        return self._solve_assignment.border_covariance()[np.ix_(at, at)]
+        return self._solved.border_covariance()[np.ix_(at, at)]
 
     @cached_property
     def with_states(self) -> FloatArray:
         """(G, 11) covariance of everything with the calibration states: poses, known landmarks, states."""
-        tree, part = self._solve_assignment.system.tree, self._block
+        tree, part = self._solved.system.tree, self._block
         begin = tree.begin
         first, states = begin[part.first], begin[part.border]
         rows = [
@@ -495,8 +495,8 @@ class Marginals:
             (begin[part.landmarks][:, None] + np.arange(2)).ravel(),
             np.arange(states, states + N_STATES),
         ]
-        if not self._solve_assignment.system.has_border_throughout:
-            found: FloatArray = self._solve_assignment.columns(part.border + np.arange(2))[np.concatenate(rows)]
+        if not self._solved.system.has_border_throughout:
+            found: FloatArray = self._solved.columns(part.border + np.arange(2))[np.concatenate(rows)]
             return found
         at = int(tree.in_border[part.border])
         return self._held.with_border[np.concatenate(rows), at : at + N_STATES]
@@ -520,7 +520,7 @@ class Marginals:
             every.insert(0, part.first + poses)
         if states:
             every.append(part.border + np.arange(2))
-        found = self._solve_assignment.joint(np.concatenate(every))
+        found = self._solved.joint(np.concatenate(every))
         if known.all():
             return found
         before, after = np.ones(3 * n_poses, bool), np.ones(N_STATES if states else 0, bool)
@@ -535,11 +535,11 @@ class Marginals:
         The matrices `by` are (V, R, 3 P + 2 L + 11).
         """
         every = [self._block.first + poses, self._variables(landmarks), self._block.border + np.arange(2)]
-        return self._solve_assignment.each(np.concatenate(every), by)
+        return self._solved.each(np.concatenate(every), by)
 
     def product(self, landmarks: IntArray, matrix: FloatArray) -> FloatArray:
         """Return (2 L, K) the joint covariance of known landmarks (L,) times a matrix (2 L, K), without the former."""
-        return self._solve_assignment.product(self._variables(landmarks), matrix)
+        return self._solved.product(self._variables(landmarks), matrix)
 
     def _variables(self, landmarks: IntArray) -> IntArray:
         """Variables of known landmarks (K,)."""
@@ -557,7 +557,7 @@ class Marginals:
         n = self._n
         kept = np.append(np.repeat(self.known, 2), np.ones(N_STATES, dtype=bool))
         cross = np.zeros((n, 3, len(kept)))
-        found = self._solve_assignment.columns(np.append(self._block.landmarks, self._block.border + np.arange(2)))
-        first = self._solve_assignment.system.tree.begin[self._block.first]
+        found = self._solved.columns(np.append(self._block.landmarks, self._block.border + np.arange(2)))
+        first = self._solved.system.tree.begin[self._block.first]
         cross[:, :, kept] = found[first : first + 3 * n].reshape(n, 3, -1)
         return cross

@@ -96,7 +96,7 @@ class StreamingSlam:
         self._relinearised_at = 0
         self._align_tried = 0
         self._scale = 1.0
-        self._align_classes = False
+        self._aligned = False
         self.online_pose = np.full((len(problem.stamp_s), 3), np.nan)
         """(N, 3) causal poses, as soon as each frame was processed."""
         self.online_covariance = np.full((len(problem.stamp_s), 3, 3), np.nan)
@@ -124,7 +124,7 @@ class StreamingSlam:
         self._owed_ms = self._a_frame_ms()
         if not later:
             self.work()
-        if self._prior_map is not None and not self._align_classes:
+        if self._prior_map is not None and not self._aligned:
             self._lay_over_map()
         self.online_pose[row], self.online_covariance[row] = self._report_pose(
             self._filter.pose, self._filter.covariance
@@ -133,7 +133,7 @@ class StreamingSlam:
     def _report_pose(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A pose and its covariance in metres, of the robot's front, in the frame of the first one or of the map."""
         front = self._prior.front(self._filter.states, self._problem.mount)
-        return told(pose, covariance, front, self._scale, self._align_classes)
+        return told(pose, covariance, front, self._scale, self._aligned)
 
     @property
     def states(self) -> FloatArray:
@@ -150,7 +150,7 @@ class StreamingSlam:
     def places(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return (k, 2) where landmarks of the newest pose are, in the frame of `online_pose`, and (k, 2, 2)."""
         front = self._prior.front(self._filter.states, self._problem.mount)
-        back = np.zeros(3) if self._align_classes else se2.inverse(front)
+        back = np.zeros(3) if self._aligned else se2.inverse(front)
         turn = se2.rotation(float(back[2]))
         covariance = turn @ self._filter.spread(rows) @ turn.T
         return se2.transform(back, self._filter.position[rows]) * self._scale, covariance * self._scale**2
@@ -204,14 +204,14 @@ class StreamingSlam:
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
         self.work()
-        if self._prior_map is not None and not self._align_classes:
+        if self._prior_map is not None and not self._aligned:
             self._lay_over_map(final=True)
         self._job = None
         problem, estimate = self._problem.until(self._n_poses), self._filter.estimate()
         batch = Batch(self._prior, self._start_noise, self._method, self._settings)
-        if self._framed and not self._align_classes:
+        if self._framed and not self._aligned:
             return batch.solved(SolvedPart(problem, estimate, self._noise, fits=True), None, self._framed)
-        return batch.finished(problem, estimate, self._noise, aligned=self._align_classes)
+        return batch.finished(problem, estimate, self._noise, aligned=self._aligned)
 
     def _assign(self, row: int, detections: IntArray) -> None:
         """Ask the method for the places of the coming pose's detections."""
@@ -322,7 +322,7 @@ class StreamingSlam:
         marginals = yield from smoother.marginals_in_slices(estimate)
         if learn:
             unknown = np.zeros((N_STATES, N_STATES))
-            self._scale = 1.0 if self._align_classes else self._prior.split_scale(estimate.states, unknown)[2]
+            self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, unknown)[2]
         following = SessionFilter(self._problem if revised is None else revised, self._noise, robust=self._robust)
         following.restart(estimate, self._noise, following.problem, marginals)
         yield 1.0
@@ -362,7 +362,7 @@ class StreamingSlam:
         """Move the estimate from the first pose's frame into the prior map's, then constrain it by the map."""
         assert self._prior_map is not None
         self._problem, moved = entered(self._problem, estimate, self._prior_map, self._prior, pose_map_world)
-        self._align_classes, self._scale = True, 1.0
+        self._aligned, self._scale = True, 1.0
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
         self._landmark = moved.landmark.copy()

@@ -200,7 +200,7 @@ def test_rejected_trials_change_nothing(seed: int, monkeypatch: pytest.MonkeyPat
         return -math.inf
 
     with monkeypatch.context() as no:
-        no.setattr("evermap.slam.association.associator.find_most_rise", rejected)
+        no.setattr("evermap.slam.association.associator.find_accepted_rise", rejected)
         no.setattr("evermap.slam.association.in_plane._is_better", lambda *_: rejected() > 0.0)
         assert associator._merge_duplicates(solved) is solved
         assert len(trials) > 1

@@ -63,10 +63,7 @@ def test_a_motion_of_all_of_the_map_that_was_seen_is_no_change() -> None:
     assert without_common_motion((rest, most), seen, given) == (rest,)
     assert without_common_motion((most, later), seen, given) == (later,)  # 3 alone, while it had not moved, is no frame
     pair, others = MovedGroup(np.array([0, 1]), False, turn, 0), MovedGroup(np.array([2, 3]), False, turn, 2)
-    assert without_common_motion((pair, others), seen, given) == (
-        pair,
-        others,
-    )  # as many as moved stood in their places
+    assert without_common_motion((pair, others), seen, given) == (pair, others)  # as many were in their places
     assert without_common_motion((pair, later), seen, given) == (pair, later)  # 2 stayed
     assert without_common_motion((whole,), np.append(seen, 4), given) == (whole,)
     assert without_common_motion((whole,), seen, GivenMap.empty(6)) == (whole,)

@@ -108,7 +108,7 @@ def test_rejected_trials_in_space_change_nothing(monkeypatch):
         return -math.inf
 
     with monkeypatch.context() as no:
-        no.setattr("evermap.slam.association.associator.find_most_rise", rejected)
+        no.setattr("evermap.slam.association.associator.find_accepted_rise", rejected)
         assert associator._merge_duplicates(solved) is solved
     assert trials
     assert len(associator._merge_duplicates(solved).estimate.place) == len(found.estimate.place)

@@ -232,12 +232,13 @@ def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
     """Beside the same others, or with those that are asked now left out."""
     asked, left_out = [], []
 
-    def ask(_optimum, _free, row, _interval):
+    def ask(_optimum, _free, _at, row, _interval):
         asked.append(row)
 
+    monkeypatch.setattr(moved_within, "as_seen", lambda *_: None)
     monkeypatch.setattr(moved_within, "_without", lambda _, suspects: left_out.append(suspects.tolist()))
     monkeypatch.setattr(moved_within, "_at_two_places", ask)
-    optimum = SimpleNamespace()
+    optimum = SimpleNamespace(smoother=SimpleNamespace(problem=SimpleNamespace(measured=None)))
     _, single = moved_within.find_two_places(optimum, np.array([4, 1, 0, 2, 8]), 0.95, frozenset({1}))
     assert asked == [4, 0, 2, 8]
     found = moved_within.find_two_places(optimum, np.array([4, 1, 0, 2, 8, 7]), 0.95, single)

@@ -173,8 +173,8 @@ def repair(recording: AnyRecording) -> AnyRecording:
 
 
 def drive_of(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
-    """Return what all copies of a drive have in common after `repair`: (F,) stamps of frames, and (M, K)
-    sorted readings, each with the stamp of its frame, in single precision, as in a session that was condensed.
+    """Return what all copies of a drive have in common after `repair`: (F,) stamps of frames, and (M, K) sorted
+    readings, each with the stamp of its frame, in single precision, as in a session that was condensed.
     """
     seen, stamp_s = recording.detections, recording.frames.stamp_s
     if isinstance(seen, Detections):

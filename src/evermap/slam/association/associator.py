@@ -24,7 +24,7 @@ from evermap.config import SlamConfig
 from evermap.slam.association.assignment import NOBODY, same_name, visits_of
 from evermap.slam.association.features import Traits, best_with_traits, learned
 from evermap.slam.association.jcbb import Pairings, pairing_probability
-from evermap.slam.association.merging import Solution, find_most_rise, merge_while_any, propose_merges
+from evermap.slam.association.merging import Solution, find_accepted_rise, merge_while_any, propose_merges
 from evermap.slam.association.revise import LAST_ROUNDS
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -250,7 +250,7 @@ class Associator(ABC, Generic[AssignmentT, FoundT, SolvedT, NearT]):
         def merge(solved: SolvedT, pairs: list[tuple[int, int]]) -> SolvedT | None:
             trial = self._solve_merged(solved, pairs)
             numbers = solved.numbers[[u for u, _ in pairs]]
-            rise = find_most_rise(pairs, solved.sightings, numbers, self._rules)
+            rise = find_accepted_rise(pairs, solved.sightings, numbers, self._rules)
             return trial if trial.cost - solved.cost <= rise else None
 
         return merge_while_any(solved, propose, merge)

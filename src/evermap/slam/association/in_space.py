@@ -243,7 +243,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         self._at = se3.transform(mount, problem.measured[:, :3])
         self._root = self._rules.noise_caution * se3.rotation_of(mount) @ np.linalg.inv(problem.measured_root)
         self._ways = se3.compose(mount, problem.either)
-        self._turn_axes = problem.kind != POINT
+        self._turned = problem.kind != POINT
         self._view = np.unique(problem.pose_row * len(problem.mount) + problem.sensor, return_inverse=True)[1]
 
     def _begun(self, begun: SpatialSolution | None) -> SpatialSolution:
@@ -373,14 +373,14 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         mine = np.repeat(self._ways[:, detection], 2, axis=0)
         angle = symmetries.angle_between(mine, np.concatenate([ways, ways])).min(axis=0)
         sigma = np.hypot(np.hypot(sigma, self._problem.sigma_rad[detection]), rules.turn_floor_rad)
-        return np.asarray(~turned | ~self._turn_axes[detection] | (angle <= rules.turn_sigmas * sigma))
+        return np.asarray(~turned | ~self._turned[detection] | (angle <= rules.turn_sigmas * sigma))
 
     def _update(self, known: IntArray, new: IntArray) -> None:
         near, seen = self._near, np.append(known, new)
         near.meet(self._row[new])
         at = np.searchsorted(near.row, self._row[seen])
         near.update(at, self._at[seen], self._covariance(seen, self._noise))
-        sigma = np.where(self._turn_axes[seen], self._problem.sigma_rad[seen], 0.0)
+        sigma = np.where(self._turned[seen], self._problem.sigma_rad[seen], 0.0)
         near.ways[:, at], near.sigma_rad[at] = self._ways[:, seen], sigma
 
     def _with_noise(self, start: SpatialAssignment) -> SpatialSolution:
@@ -401,7 +401,7 @@ class SpatialAssociator(Associator[SpatialAssignment, SpatialSolution, SpatialSo
         problem, used = self._problem, np.flatnonzero(row >= 0)
         first = np.unique(row[used], return_index=True)[1]
         turned = np.zeros(len(first), dtype=np.bool_)
-        turned[row[used][self._turn_axes[used]]] = True
+        turned[row[used][self._turned[used]]] = True
         symmetries = problem.symmetries[problem.place[used[first]]]
         return replace(problem.seeing(used), place=row[used], oriented=turned, symmetries=symmetries)
 

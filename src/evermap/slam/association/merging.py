@@ -132,7 +132,7 @@ def propose_merges(
     return _without_contradictions(sorted(set(merges)), solution.kind)
 
 
-def find_most_rise(
+def find_accepted_rise(
     pairs: list[tuple[int, int]], sightings: IntArray, numbers: int | IntArray, settings: AssociationConfig
 ) -> float:
     """Return the rise of the cost that merging pairs may cause [nats].

@@ -68,7 +68,7 @@ class Joint(Method):
         self._count, self._calibration, self._given = n_landmarks, calibration, given
         self._prior, self._robust, self._fewest = settings.changes, settings.robust, settings.fewest_sightings
         self._ranges = settings.ranges
-        self._loosen: _Loosened | None = None
+        self._loosened: _Loosened | None = None
         self._concluded: Explanation | None = None
         self._landmark = np.arange(n_landmarks)
         self._groups: Groups = ()
@@ -102,8 +102,8 @@ class Joint(Method):
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
         weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
         unmapped = replace(free, landmark_information=sparse.csr_array(free.landmark_information.shape))
-        self._loosen = _Loosened(problem, free, outvote(unmapped, start, weights, self._fewest))
-        return free, self._loosen.start
+        self._loosened = _Loosened(problem, free, outvote(unmapped, start, weights, self._fewest))
+        return free, self._loosened.start
 
     def _where_most_agree(self, estimate: Estimate) -> Estimate:
         """The whole moved to where most landmarks are at their places: those seen first may have been the others."""
@@ -131,9 +131,9 @@ class Joint(Method):
             return replace(self._concluded, problem=problem, estimate=estimate)
         if final:
             self.posterior = None  # hypotheses found on the way are not assumed
-            if self._loosen is not None:
+            if self._loosened is not None:
                 # what has not been explained yet may look like outliers on the wrong side: none is ruled out here
-                problem, free, start = self._loosen
+                problem, free, start = self._loosened
                 smoother = Smoother(free, noise, heavy=True, robust=self._robust)
                 estimate = smoother.optimum(start, iterations=10, tolerance=1e-4)
                 # what moved has turned the whole, too: linear evidence of ranges would not turn it back

@@ -212,7 +212,7 @@ class _SpatialFrame:
     def __init__(self, of: SpatialFilter, rows: IntArray, seen: SpatialFrame) -> None:
         count, self._of = len(rows), of
         self._pose, self._states, self._place = of.pose, of.states, of.position[rows]
-        self._turn_axes = turned = np.isfinite(self._place[:, 3])
+        self._turned = turned = np.isfinite(self._place[:, 3])
         self._place_or_still = np.where(turned[:, None] | (np.arange(7) < 3), self._place, STILL)
         kind, dim = np.where(turned, seen.kind, POINT), np.where(turned, 6, 3)
         self.n_rows = ROWS[kind]
@@ -238,17 +238,17 @@ class _SpatialFrame:
         by_place, turn = step[own:].reshape(-1, OF_PLACE), se3.rotation_of(start)
         place = self._place_or_still
         if by_place.any():
-            place = _carry_by_steps(place, by_place, turn @ step[3:6], self._turn_axes)
+            place = _carry_by_steps(place, by_place, turn @ step[3:6], self._turned)
         linearise_sightings(
             se3.retract(start, step[:6])[None], place, of._mount_at(self._states + step[6:own]), of._back, of._back,
             of.levels, self._seen, False, self._values, self._weight, self._residual,
         )  # fmt: skip
         self.residual[:] = self._residual[:, : self.residual.shape[1]]
-        _unpack(self._values, self._seen.first, self.n_rows, self._turn_axes, self.jacobian)
+        _unpack(self._values, self._seen.first, self.n_rows, self._turned, self.jacobian)
         if not step[:6].any():
             return
         # from errors at the step to those before it
-        jacobian, turned = self.jacobian, self._turn_axes
+        jacobian, turned = self.jacobian, self._turned
         jacobian[..., :6] = jacobian[..., :6] @ se3.adjoint(se3.exp(-step[:6]))
         if place is self._place_or_still:
             return

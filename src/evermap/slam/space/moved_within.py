@@ -128,11 +128,11 @@ def _is_parted(optimum: SpatialOptimum, row: int) -> bool:
     """Tell whether the sightings of a place are of two places in turn, by themselves or by where others put it."""
     problem, estimate = optimum.smoother.problem, optimum.estimate
     mine = np.flatnonzero(problem.place == row)
-    if _part_sightings(optimum, estimate, mine) is not None:
-        return True
+    at = as_seen(problem, estimate, problem.measured)
     # poses that are bent to one point for two let directions meet there; ranges are of the odometry, which isn't bent
-    at = as_seen(problem, estimate, problem.measured)[mine]
-    return _part_in_two(at, bool(problem.oriented[row]), problem.settings.repair.fewest) is not None
+    if _part_in_two(at[mine], bool(problem.oriented[row]), problem.settings.repair.fewest) is not None:
+        return True
+    return bool(problem.ray[mine].any()) and _part_sightings(optimum, estimate, at, mine) is not None
 
 
 def _frames_beside_jumps(optimum: SpatialOptimum) -> BoolArray:
@@ -192,9 +192,10 @@ def _find_among(
     if not asked:
         return None, single
     free = _without(optimum, suspects)
+    at = as_seen(optimum.smoother.problem, free, optimum.smoother.problem.measured)
     found = list[TwoPlaces]()
     for row in asked:
-        two = _at_two_places(optimum, free, row, interval)
+        two = _at_two_places(optimum, free, at, row, interval)
         if two is None:
             single |= {row}
         else:
@@ -207,12 +208,15 @@ def _find_among(
     return best._replace(optimum=better, nats=nats), single
 
 
-def _at_two_places(optimum: SpatialOptimum, free: SpatialEstimate, row: int, interval: float) -> TwoPlaces | None:
+def _at_two_places(
+    optimum: SpatialOptimum, free: SpatialEstimate, at: FloatArray, row: int, interval: float
+) -> TwoPlaces | None:
     """The optimum with a landmark at two places; None where it was seen at both in turns, or is at one.
 
     Args:
         optimum: with one place.
         free: values without what is suspected.
+        at: (M, 7) where detections put their places then.
         row: the place.
         interval: as of `find_two_places`.
     """
@@ -220,7 +224,7 @@ def _at_two_places(optimum: SpatialOptimum, free: SpatialEstimate, row: int, int
     mine = np.flatnonzero(problem.place == row)
     if len(mine) < 2 * settings.repair.fewest:
         return None
-    parted = _part_sightings(optimum, free, mine)
+    parted = _part_sightings(optimum, free, at, mine)
     if parted is None:
         return None
     cut, old, new = parted
@@ -279,21 +283,21 @@ def _settle(problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise
 
 
 def _part_sightings(
-    optimum: SpatialOptimum, estimate: SpatialEstimate, mine: IntArray
+    optimum: SpatialOptimum, estimate: SpatialEstimate, at: FloatArray, mine: IntArray
 ) -> tuple[int, FloatArray, FloatArray] | None:
-    """Return how sightings (K,) of one landmark part into those of two places, along given values; None if it is one.
+    """Return how sightings (K,) of one landmark part into those of two places, along given values, by which detections
+    put their places `at` (M, 7); None if it is one.
 
     The ranges of directions are no part of it: they were triangulated as if everything stood, from sightings of both
     places where these are close in time.
     """
     problem, fewest = optimum.smoother.problem, optimum.smoother.problem.settings.repair.fewest
-    at = as_seen(problem, estimate, problem.measured)[mine]
     if not problem.ray[mine].any():
-        return _part_in_two(at, bool(problem.oriented[problem.place[mine[0]]]), fewest)
+        return _part_in_two(at[mine], bool(problem.oriented[problem.place[mine[0]]]), fewest)
     eye_m = as_seen(problem, estimate, se3.identity(len(problem.place)))[mine, :3]
     range_m = np.linalg.norm(problem.measured[mine, :3], axis=1)
     sigma_rad = optimum.noise.across * problem.sigma_position_m[mine, 0] / range_m
-    parted = _part_rays(eye_m, (at[:, :3] - eye_m) / range_m[:, None], sigma_rad, fewest)
+    parted = _part_rays(eye_m, (at[mine, :3] - eye_m) / range_m[:, None], sigma_rad, fewest)
     if parted is None:
         return None
     cut, *both_m = parted

@@ -28,7 +28,7 @@ def stream(moving: MovingWorld, method: object, *, told: bool = False) -> Outcom
     )
     slam._problem = replace(problem, prior=default_prior())  # the map is given, as after entering one
     slam._filter.problem = slam._problem
-    slam._align_classes = True
+    slam._aligned = True
     for _ in range(len(problem.stamp_s)):
         slam.step()
     return slam.finish()
