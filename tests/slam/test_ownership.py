@@ -11,7 +11,7 @@ from benchmarks.yard import error_m, is_true
 import evermap as em
 from evermap.config import Config
 from evermap.geometry import se3
-from evermap.slam.co_motion import Movers, find_movers, locate_by_odometry, pair_movers
+from evermap.slam.co_motion import Movers, Reckoned, find_movers, locate_by_odometry, pair_movers
 from evermap.slam.ownership import OWNED, PRIOR, find_links, find_owned, weigh_looks, with_owned
 from evermap.slam.space.box_owners import Sights, see_boxes
 from evermap.slam.space.moving import is_located
@@ -134,6 +134,30 @@ def test_an_odometry_that_errs_moves_no_landmark() -> None:
         pose.append(se3.compose(pose[-1], one))
     wrong = replace(drive.recording, odometry=replace(odometry, pose_world_robot=np.array(pose)))
     assert movers_of(wrong) is None
+
+
+def looks_at(spans: list[tuple[int, float, float, float]]) -> Reckoned:
+    """Five looks a second at landmarks (id, from [s], until [s], speed by the odometry [m/s])."""
+    rows = [
+        (one, t, mps * (t - since_s)) for one, since_s, until_s, mps in spans for t in np.arange(since_s, until_s, 0.2)
+    ]
+    name, stamp_s, way_m = (np.array(column) for column in zip(*rows, strict=True))
+    at = np.column_stack([way_m, 3.0 * name, np.zeros(len(rows))])
+    frame, own = np.round(5.0 * stamp_s).astype(np.int64), at - [0.0, 0.0, 0.5]
+    sigma_m, turn = np.full(len(rows), 0.05), np.full((len(rows), 3, 3), np.nan)
+    return Reckoned(name, stamp_s, frame, np.arange(len(rows)), at, sigma_m, own, sigma_m, turn)
+
+
+@pytest.mark.parametrize(
+    ("stands_s", "moves"), [(10.0, False), (15.0, True)], ids=["glimpsed", "beside one that stands"]
+)
+def test_a_landmark_moves_beside_one_that_stands(stands_s: float, moves: bool) -> None:
+    """Where others are seen too briefly to tell, an odometry that is silent for five seconds explains as much."""
+    others = [(0, 0.0, stands_s, 0.0), (1, 0.0, 10.0, 0.0), (2, 0.0, 10.0, 0.0)]
+    glimpses = [(4, 11.0, 11.4, 0.5), (5, 12.0, 12.4, 0.5), (6, 13.0, 13.4, 0.5)]
+    movers = find_movers(looks_at([*others, (3, 10.0, 15.0, 0.5), *glimpses]), Config())
+    assert (movers is not None) is moves
+    assert movers is None or movers.landmark_id.tolist() == [3]
 
 
 def test_a_wall_behind_a_parked_forklift_is_not_owned_once_it_drives_off() -> None:

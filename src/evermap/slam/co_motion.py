@@ -32,7 +32,9 @@ MOVES = 3.0
 OFTEN = 0.15
 """Share of the looks at a landmark in which it moves, at least: wrong identities move for a moment."""
 MOST_MOVE = 0.5
-"""Share of the landmarks in view that may move: where more seem to, the odometry is wrong."""
+"""Share of the landmarks in view that may move, of those that are seen to move or to stand: where more seem to, the
+odometry is wrong.
+"""
 LEAST_M = 0.02
 """Error of a position that says what it is, at least [m]."""
 APART, FEWEST_COMMON = 0.15, 5
@@ -148,11 +150,11 @@ def find_movers(found: Reckoned, config: Config) -> Movers | None:
     if not len(suspects) or len(suspects) > MOST_MOVE * len(known):
         return None
     factor, limit_mps = np.zeros(len(found.stamp_s)), config.slam.space.bodies.limit_mps
-    beside = np.unique(found.landmark_id[np.isin(found.frame, found.frame[np.isin(found.landmark_id, suspects)])])
+    beside = np.unique(found.landmark_id[_is_near(found, np.isin(found.landmark_id, suspects), still.window_s)])
     for one in beside.tolist():
         mine = slice(*np.searchsorted(found.landmark_id, [one, one + 1]))
         factor[mine] = _weigh_windows(found.stamp_s[mine], found.at[mine, :2], found.sigma_m[mine], limit_mps, still)
-    moves = (factor < -MOVES) & ~_is_in_doubt(found, factor < -MOVES, still.window_s)
+    moves = (factor < -MOVES) & ~_is_in_doubt(found, factor, still.window_s)
     names, count = np.unique(found.landmark_id[moves], return_counts=True)
     looks = np.searchsorted(found.landmark_id, names, "right") - np.searchsorted(found.landmark_id, names)
     names = names[np.isin(names, suspects) & (count >= np.maximum(FEWEST, OFTEN * looks))]
@@ -198,17 +200,33 @@ def _weigh_windows(
     )
 
 
-def _is_in_doubt(found: Reckoned, moves: BoolArray, window_s: float) -> BoolArray:
-    """(N,) looks around which so many landmarks seem to move that the odometry may be wrong."""
+def _is_near(found: Reckoned, some: BoolArray, window_s: float) -> BoolArray:
+    """(N,) looks within half a window of some."""
+    at_s = np.sort(found.stamp_s[some])
+    first = np.searchsorted(at_s, found.stamp_s - 0.5 * window_s)
+    return np.searchsorted(at_s, found.stamp_s + 0.5 * window_s, "right") > first
+
+
+def _is_in_doubt(found: Reckoned, factor: FloatArray, window_s: float) -> BoolArray:
+    """(N,) looks around which so many landmarks seem to move, of those that are seen to move or to stand, that the
+    odometry may be wrong: without any that stands, it is as probable as a motion.
+
+    What is seen to stand until then, or from then on, says nothing of the odometry between.
+    """
+    moves, stands = factor < -MOVES, factor > 0.0
     doubt = np.zeros(len(moves), dtype=np.bool_)
     order = np.argsort(found.stamp_s, kind="stable")
     stamp_s = found.stamp_s[order]
     for row in np.flatnonzero(moves).tolist():
         at_s = found.stamp_s[row]
-        first, last = np.searchsorted(stamp_s, [at_s - 0.5 * window_s, at_s + 0.5 * window_s])
-        near = order[first:last]
-        all_of = len(np.unique(found.landmark_id[near]))
-        doubt[row] = len(np.unique(found.landmark_id[near[moves[near]]])) > MOST_MOVE * all_of
+        first, since, until, last = np.searchsorted(
+            stamp_s, [at_s - 0.5 * window_s, at_s, np.nextafter(at_s, np.inf), at_s + 0.5 * window_s]
+        )
+        moving = np.unique(found.landmark_id[order[first:last]][moves[order[first:last]]])
+        before, after = order[first:until], order[since:last]
+        standing = np.intersect1d(found.landmark_id[before[stands[before]]], found.landmark_id[after[stands[after]]])
+        standing = np.setdiff1d(standing, moving)
+        doubt[row] = len(moving) > MOST_MOVE * (len(moving) + len(standing))
     return doubt
 
 
