@@ -368,7 +368,7 @@ def _judge_in_map(
     """
     from evermap.maps.sessions import session, solve
 
-    judged = _add_verdict(entered, visit, before, config, found)
+    judged = _add_verdict(solve.with_put_right(entered, config), visit, before, config, found)
     if not (config.slam.explain.on and entered.found and solve.is_doubtful(judged)):
         return judged
     explained = solve.find_causes(entered, before, config, is_suspected=_is_held(judged.slam))

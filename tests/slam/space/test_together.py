@@ -17,6 +17,7 @@ from evermap.maps.sessions.spatial import solve_visit
 from evermap.metrics.summary import compare_with_truth
 from evermap.slam.space.together import SolvedRobot, _lay_together, align_robots
 from evermap.types import Frames, SpatialRecording, rows_of
+from evermap_studies.causes.drives import MAKES, SITES, as_recording, simulate
 
 from .corridors import tagged_corridor
 from .halls import hall
@@ -65,6 +66,23 @@ def test_two_robots_know_the_hall_better_than_each_alone(seed):
     true = se3.compose(offset, recordings[2].truth.pose_world_robot)
     away = np.linalg.norm(results[2].trajectory.pose_world_robot[:, :3] - true[:, :3], axis=1)
     assert np.sqrt(np.mean(away**2)) < 0.4
+
+
+def test_robots_that_see_corners_lose_none_where_their_frames_meet_to_within_centimetres(monkeypatch):
+    """A quarter of the second one's corners were let go, and its levels were those of detections worth a twentieth."""
+    make = MAKES["corners"]
+    site = SITES[make.site](np.random.default_rng([1, 99]))
+    monkeypatch.setitem(SITES, make.site, lambda _: site)
+    robots = {number: as_recording(simulate(make, 1000 * number + 1, in_map=False)) for number in (1, 2)}
+    together, alone = run_together(robots), run_slam(robots[2])
+    for result in together.values():
+        assert np.mean(result.innovations.p_inlier < 0.5) < 0.005
+        sigma_px = next(one.value for one in result.parameters if one.name == "sigma_corner_px")
+        assert sigma_px == pytest.approx(0.3, rel=0.05)
+    sigma_m = [
+        np.median(np.trace(one.landmarks.covariance_m2, axis1=1, axis2=2)) ** 0.5 for one in (together[2], alone)
+    ]
+    assert 0.3 < sigma_m[0] / sigma_m[1] < 1.0
 
 
 def test_covariances_are_those_of_a_dense_inverse():

@@ -33,7 +33,7 @@ from evermap.maps.sessions.box_visit import BoxVisit, SeenBoxes, list_boxes
 from evermap.maps.sessions.placing import NOT_FOUND, Laid, Localised, one_to_one, widened
 from evermap.maps.sessions.spatial import SpatialVisit, localise_in_space
 from evermap.maps.vicinity import cliques_of
-from evermap.slam.space.estimate import SpatialOptimum, converge
+from evermap.slam.space.estimate import SpatialOptimum, converge_again
 from evermap.slam.space.moving import TrafficIntake, has_traffic, rescale, solve_in_traffic, take_in_traffic
 from evermap.slam.space.problem import PlacePrior
 from evermap.slam.space.result import identities_of
@@ -148,7 +148,7 @@ def _move_session(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum
     place = se3.compose(motion, estimate.place)
     place[~oriented, 3:] = se3.NO_TURN
     estimate = replace(estimate, pose=se3.compose(motion, estimate.pose), place=place)
-    return converge(optimum.smoother.problem, estimate, optimum.noise, heavy_rounds=0)
+    return converge_again(optimum, optimum.last[0].problem, estimate)
 
 
 def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, settings: BoxesConfig) -> SpatialSolved:
@@ -164,7 +164,7 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
     began[seen.place] = seen.first_s
     order = np.lexsort((began, part))
     head = order[np.append(True, np.diff(part[order]) > 0)]  # the earliest of each part
-    problem, estimate = solved.optimum.smoother.problem, solved.optimum.estimate
+    problem, estimate = solved.optimum.last[0].problem, solved.optimum.estimate
     weight = np.bincount(problem.place, minlength=count) + 1e-9
     place = estimate.place[head].copy()
     total = np.bincount(part, weight)
@@ -179,7 +179,7 @@ def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray, sett
         symmetries=problem.symmetries[head],
         prior=prior,
     )
-    optimum = converge(problem, replace(estimate, place=place), solved.optimum.noise, heavy_rounds=0)
+    optimum = converge_again(solved.optimum, problem, replace(estimate, place=place))
     return replace(
         solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head],
         moves=tuple(one._replace(before=int(part[one.before]), after=int(part[one.after])) for one in solved.moves),
@@ -266,13 +266,13 @@ def _hold_places(solved: SpatialSolved, living: LivingMap, matched: _Matched, se
     sigma[:, :3] = np.sqrt(own + settings.drift_m**2)[:, None]
     sigma[:, 2] = np.hypot(sigma[:, 2], settings.height_m)
     prior = PlacePrior(row, pose, sigma, matched.probability[row])
-    problem = replace(optimum.smoother.problem, prior=prior, start_sigma=FREE, steady=True)
+    problem = replace(optimum.last[0].problem, prior=prior, start_sigma=FREE, steady=True)
     noise, found = optimum.noise, optimum
     for translation, rotation in ((0.0, 0.0), *WANDERS):
         if translation <= noise.translation and translation > 0.0:
             continue
         noise = replace(noise, translation=max(translation, noise.translation), rotation=max(rotation, noise.rotation))
-        found = converge(problem, optimum.estimate, noise, heavy_rounds=0)
+        found = converge_again(replace(optimum, noise=noise), problem, optimum.estimate)
         off = ((found.estimate.place[row, :2] - pose[:, :2]) / sigma[:, :2]) ** 2
         if (
             max((float(off[k : k + STRETCH].mean()) for k in range(0, len(off), STRETCH)), default=0.0)

@@ -14,7 +14,7 @@ from evermap.explain.answer import in_given_units
 from evermap.explain.causes.suspect import Inputs
 from evermap.explain.competition import explain
 from evermap.explain.evidence import AnySession, SpatialSession
-from evermap.explain.put_right import find_late_sensor
+from evermap.explain.put_right import find_late_sensor, find_put_right
 from evermap.explain.scores import ScreenedSession
 from evermap.explain.trial import Explained, SessionSolution, Trial
 from evermap.maps.living import EXISTS, LivingMap
@@ -130,6 +130,14 @@ def find_causes(
         return explain_session(Inputs.of(session.recording, expected), config, (), is_suspected=is_suspected)
     except (DataError, NumericalError):
         return None
+
+
+def with_put_right(session: Session, config: Config) -> Session:
+    """Return a session that was found in its map with what the estimator itself put right: clocks and scales."""
+    if not (session.found and config.slam.explain.on):
+        return session
+    causes = find_put_right(session.slam, Inputs.of(session.recording, None), config.slam)
+    return replace(session, slam=replace(session.slam, causes=(*session.slam.causes, *causes)))
 
 
 def is_doubtful(session: Session) -> bool:

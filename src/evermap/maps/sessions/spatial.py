@@ -31,7 +31,7 @@ from evermap.slam.intake import find_bodies, most_of
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.bodies import with_rests
 from evermap.slam.space.bridge import bridge
-from evermap.slam.space.estimate import SpatialOptimum, converge
+from evermap.slam.space.estimate import SpatialOptimum, converge_again
 from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
 from evermap.slam.space.result import conclude_in_space, identities_of, located, numbered
@@ -456,7 +456,7 @@ def _fuse_places(
 def _hold_places(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum:
     """Solve the session once more, with matched landmarks constrained to their places in the map."""
     optimum = visit.optimum
-    problem, places = optimum.smoother.problem, living.places
+    problem, places = optimum.last[0].problem, living.places
     _, row, at = np.intersect1d(visit.landmark_id, where.landmark_id[where.place >= 0], return_indices=True)
     place = where.place[where.place >= 0][at]
     pose = se3.identity(len(row))
@@ -472,4 +472,4 @@ def _hold_places(visit: SpatialVisit, living: LivingMap, where: Laid) -> Spatial
     sigma[:, 3:][unseen > 0.0] = ANY_RAD
     prior = PlacePrior(row.astype(np.int64), pose, sigma, np.ones(len(row)))
     problem = replace(problem, prior=prior, start_sigma=FREE)
-    return converge(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
+    return converge_again(optimum, problem, optimum.estimate)

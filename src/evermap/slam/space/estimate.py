@@ -96,6 +96,46 @@ def converge(
     return SpatialOptimum(estimate, learned, smoother, now)
 
 
+def with_worth(
+    optimum: SpatialOptimum, share: FloatArray | None = None, sober: SpatialNoise | None = None
+) -> SpatialOptimum:
+    """Return the same values, with covariances that count detections as what they are worth beside others of a place.
+
+    Args:
+        optimum: as `converge` returns it.
+        share: (M,) of their information that is new, as of `SpatialSmoother.counted`.
+        sober: levels that covariances are of; None for those of the optimum.
+    """
+    smoother = optimum.smoother.counted(optimum.estimate, optimum.now, share)
+    sober = optimum.noise if sober is None else sober
+    now = smoother.linearised(optimum.estimate, sober, heavy=False)
+    return replace(optimum, smoother=smoother, now=now, fitted=(optimum.smoother, optimum.now), sober=sober)
+
+
+def converge_again(before: SpatialOptimum, problem: SpatialProblem, start: SpatialEstimate) -> SpatialOptimum:
+    """Return the optimum of a problem that differs little from the one that values are the optimum of (`last`).
+
+    Detections are worth in its covariances what they were before, and its odometry is no better there than it was.
+
+    Args:
+        before: the optimum.
+        problem: of the same detections, in their order.
+        start: values to start from.
+    """
+    found = converge(problem, start, before.noise, heavy_rounds=0)
+    if before.fitted is None:
+        return found
+    return with_worth(found, before.smoother.problem.share, level_soberly(found.noise, before))
+
+
+def level_soberly(noise: SpatialNoise, before: SpatialOptimum) -> SpatialNoise:
+    """Return levels that covariances are of, where the odometry is no better than other evidence `before` had it."""
+    was = before.noise if before.sober is None else before.sober
+    return replace(
+        noise, translation=max(noise.translation, was.translation), rotation=max(noise.rotation, was.rotation)
+    )
+
+
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
     """Return noise levels after a step towards those of restricted likelihood, by inlier weight.
 

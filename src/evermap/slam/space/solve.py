@@ -34,6 +34,7 @@ from evermap.slam.space.estimate import (
     first_places,
     locate_unseen,
     oriented,
+    with_worth,
 )
 from evermap.slam.space.explanation import explain_places
 from evermap.slam.space.intake import SpatialIntake, start_noise
@@ -186,15 +187,11 @@ def solve_space(
         followed = followed | (intake.bodies != UNKNOWN)
     explanation = explain_places(optimum, identity, followed, stated, changes)
     optimum, identity, problem = explanation.optimum, explanation.identity, explanation.optimum.smoother.problem
-    smoother, sober = optimum.smoother.counted(optimum.estimate, optimum.now, counted), optimum.noise
+    sober = optimum.noise
     if drift is not None and counted is None and not problem.steady:
         goes = (drift.translation or 0.0) * drift.doubt, (drift.rotation or 0.0) * drift.doubt
         sober = replace(sober, translation=max(sober.translation, goes[0]), rotation=max(sober.rotation, goes[1]))
-    now = smoother.linearised(optimum.estimate, sober, heavy=False)
-    fitted = optimum.smoother, optimum.now
-    optimum = replace(
-        optimum, smoother=smoother, now=now, fitted=fitted, sober=sober
-    )  # for covariances, which are no better than all this
+    optimum = with_worth(optimum, counted, sober)  # covariances are no better than all this
     number, from_map = times_of(identity), explanation.from_map
     for move in reversed(explanation.moves):  # the landmark is where it was last
         number[[move.before, move.after]] = min(number[move.before], number[move.after])

@@ -26,6 +26,7 @@ from evermap.slam.space.estimate import (
     ROUNDS,
     STEPS_A_ROUND,
     SpatialOptimum,
+    level_soberly,
     refined,
 )
 from evermap.slam.space.intake import SpatialIntake
@@ -70,8 +71,8 @@ class SolvedRobot:
 
     @property
     def problem(self) -> SpatialProblem:
-        """Its last problem."""
-        return self.solved.optimum.smoother.problem
+        """The problem that its values are the optimum of."""
+        return self.solved.optimum.last[0].problem
 
     @property
     def identity(self) -> IntArray:
@@ -97,6 +98,8 @@ def solve_space_together(
     motion = align_robots(members, names, rules)
     joint, start = _lay_together(members, motion)
     begun = joint.noise
+    # where frames meet to within centimetres, corners are off by many pixels: nothing is let go before it had its say
+    start = exhaust(joint.of(begun, heavy=True).minimise_in_slices(start, _steps(FIRST_STEPS))).state
 
     def learn(joint: SpatialTogether, solution: Minimum[JointEstimate], _: int) -> tuple[SpatialTogether, bool]:
         """Return the problem with levels by a solution, and whether these are as they were."""
@@ -109,12 +112,33 @@ def solve_space_together(
 
     steps = [_steps(FIRST_STEPS if round_ == 0 else STEPS_A_ROUND) for round_ in range(ROUNDS)]
     joint, start = settle(joint, start, learn, steps)
-    optima = joint.parts(exhaust(joint.minimise_in_slices(start, _steps(LAST_STEPS))))
+    optima = _with_worth(joint, members, exhaust(joint.minimise_in_slices(start, _steps(LAST_STEPS))))
     found = []
     for member, by, optimum in zip(members, motion, optima, strict=True):
         online = se3.compose(by, member.solved.online_pose)
         found.append(replace(member.solved, optimum=optimum, online_pose=online))
     return found
+
+
+def _with_worth(
+    joint: SpatialTogether, members: Sequence[SolvedRobot], solution: Minimum[JointEstimate]
+) -> list[SpatialOptimum]:
+    """Return what each robot has of the solution, with covariances by all that count its detections as when alone."""
+    fitted, alone = joint.parts(solution), [member.solved.optimum for member in members]
+    if all(one.fitted is None for one in alone):
+        return fitted
+    robots = [
+        _Member(replace(found.smoother.problem, share=one.smoother.problem.share), found.estimate.pose)
+        for found, one in zip(fitted, alone, strict=True)
+    ]
+    sober = [level_soberly(found.noise, one) for found, one in zip(fitted, alone, strict=True)]
+    counted = SpatialTogether(robots, joint.places, joint.start_s, joint.oriented, sober)
+    now = exhaust(counted.linearise_in_slices(solution.state))
+    parts = counted.parts(Minimum(solution.state, now, None))
+    return [
+        replace(part, noise=found.noise, fitted=(found.smoother, found.now), sober=part.noise)
+        for part, found in zip(parts, fitted, strict=True)
+    ]
 
 
 def _steps(most: int) -> Steps:
@@ -198,6 +222,7 @@ class SpatialTogether(Together[JointEstimate]):
         start_s: (R,) beginning of each problem's clock on that of all.
         oriented: (P,) places with an orientation.
         noise: levels of each robot.
+        heavy: whether its detections have tails that never let go.
     """
 
     def __init__(
@@ -207,6 +232,8 @@ class SpatialTogether(Together[JointEstimate]):
         start_s: FloatArray,
         oriented: BoolArray,
         noise: Sequence[SpatialNoise],
+        *,
+        heavy: bool = False,
     ) -> None:
         self.sensor = np.cumsum([0, *(len(robot.problem.mount) for robot in robots)])
         calibration = [
@@ -215,10 +242,11 @@ class SpatialTogether(Together[JointEstimate]):
         n_poses = [len(robot.problem.stamp_s) for robot in robots]
         super().__init__(n_poses, places, calibration, poses_a_leaf=POSES_A_LEAF)
         self.robots, self.noise, self.oriented, self.start_s = tuple(robots), tuple(noise), oriented, start_s
+        self.heavy = heavy
 
-    def of(self, noise: Sequence[SpatialNoise]) -> SpatialTogether:
+    def of(self, noise: Sequence[SpatialNoise], *, heavy: bool = False) -> SpatialTogether:
         """Return the same with other levels; its structure is kept."""
-        other = SpatialTogether(self.robots, self.places, self.start_s, self.oriented, noise)
+        other = SpatialTogether(self.robots, self.places, self.start_s, self.oriented, noise, heavy=heavy)
         other._structure = self._structure
         return other
 
@@ -257,7 +285,7 @@ class SpatialTogether(Together[JointEstimate]):
         return np.column_stack([np.concatenate(when), state.pose[:, :3]])
 
     def _blocks(self, state: JointEstimate) -> list[tuple[FactorBlock[SpatialEstimate], ...]]:  # noqa: ARG002
-        return [robot.graph(own, heavy=False).blocks for robot, own in zip(self.robots, self.noise, strict=True)]
+        return [robot.graph(own, heavy=self.heavy).blocks for robot, own in zip(self.robots, self.noise, strict=True)]
 
     def _hold(self, held: FloatArray, begin: IntArray, variable: Sequence[IntArray]) -> None:
         for robot, own in zip(self.robots, variable, strict=True):
