@@ -84,7 +84,6 @@ lint: $(DEVELOPMENT)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	$(VENV)/bin/bandit --quiet --recursive --configfile pyproject.toml src studies/src
 
 # Known flaws of the pinned versions. Its database is in the internet, so it is no part of the continuous integration.
 audit: $(DEVELOPMENT)

@@ -7,7 +7,7 @@ import functools
 import gc
 import hashlib
 import os
-import pickle  # nosec  # B403: for the name of its error: the index of kept code is numba's, in a folder of this user
+import pickle  # for the name of its error: the index of kept code is numba's, in a folder of this user
 import stat
 import subprocess
 import sys
@@ -80,7 +80,7 @@ def shared_with(module: str) -> Iterator[None]:
     def start() -> None:
         command, quiet = [sys.executable, "-m", module], subprocess.DEVNULL
         with contextlib.suppress(OSError):
-            process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)  # nosec  # B603: ourselves
+            process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)  # noqa: S603  (ourselves)
             second.append(process)
 
     if (os.cpu_count() or 1) > 1:

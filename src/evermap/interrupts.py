@@ -192,7 +192,7 @@ def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 (the p
     for clean in (_stop_workers, *reversed(_cleanups), _flush):
         try:  # noqa: SIM105 (as above)
             clean()
-        except Exception:  # nosec  # B110: what comes next matters more
+        except Exception:  # noqa: S110  (what comes next matters more)
             pass
     kept_there = "; ".join(said for place, said in _kept.items() if os.path.exists(place))  # noqa: PTH110 (loads less)
     line = f"evermap: {_SIGNALS[signal.Signals(number)]}: {kept_there or 'no result was written'}\n"

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -162,12 +160,10 @@ def test_robots_are_where_their_newest_sessions_ended(fleet: Fleet, folders: lis
 
 
 def test_the_doctor_tells_what_is_wrong(fleet: Fleet, zips: list[bytes]) -> None:
-    command = [sys.executable, "-m", "evermap", "serve", "doctor", "--store", fleet.where, "--json"]
-
     def looked(*more: str) -> tuple[int, dict[str, bool]]:
-        done = subprocess.run([*command, *more], capture_output=True, text=True, check=False)
+        done = CliRunner().invoke(command, ["serve", "doctor", "--store", fleet.where, "--json", *more])
         assert not done.stderr
-        return done.returncode, {item["what"]: item["fine"] for item in json.loads(done.stdout)["checks"]}
+        return done.exit_code, {item["what"]: item["fine"] for item in json.loads(done.stdout)["checks"]}
 
     fleet.upload(zips[0])
     fleet.worker().step()
@@ -184,9 +180,8 @@ def test_the_doctor_tells_what_is_wrong(fleet: Fleet, zips: list[bytes]) -> None
 
 
 def test_the_doctor_makes_nothing_where_there_is_nothing(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "evermap", "serve", "doctor", "--url", "", "--store", str(tmp_path / "maps")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout.startswith("WRONG  database: ")) == (1, True)
+    done = CliRunner().invoke(command, ["serve", "doctor", "--url", "", "--store", str(tmp_path / "maps")])
+    assert (done.exit_code, done.stdout.startswith("WRONG  database: ")) == (1, True)
     assert not (tmp_path / "maps").exists()
 
 

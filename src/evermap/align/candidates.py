@@ -255,7 +255,8 @@ def _pairs_of_one_length(
         else:
             found.append(np.argwhere(span > 0.0) + [first, 0])
     pairs = np.sort(np.vstack([np.zeros((0, 2), dtype=np.int64), *found]), axis=1)
-    both = np.unique(pairs[:, 0] * count + pairs[:, 1])
+    low, high = pairs.T
+    both = np.unique(low * count + high)
     return both // max(count, 1), both % max(count, 1)
 
 

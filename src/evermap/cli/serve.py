@@ -132,7 +132,7 @@ def _tls(certificate: Path | None, key: Path | None) -> dict[str, str]:
             if path is certificate:
                 context.load_verify_locations(path)
             else:
-                context.load_cert_chain(certificate, key, password="")  # nosec  # B106: rather than to ask for one
+                context.load_cert_chain(certificate, key, password="")  # rather than to ask for one
         except OSError as error:
             problem = f"cannot be used: {printable(str(error.strerror or error), 100)}"
             raise ConfigError(problem, path=path, field=option_name, hint=hint) from None
@@ -311,7 +311,7 @@ def _of_address(url: str) -> tuple[str, bool, str]:
         return "address", False, f"'{printable(url, 100)}' is not the address of a server: https://maps.example.com"
     local = host in ("localhost", "127.0.0.1", "::1")
     try:
-        with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:  # nosec  # B310: http or https, see above
+        with urlopen(f"{url.rstrip('/')}/healthz", timeout=_ASK_S) as answer:  # noqa: S310  (http or https, see above)
             said = json.load(answer)
             told, workers = said["evermap"], said.get("workers", 0)
     except (OSError, ValueError, KeyError, TypeError) as error:

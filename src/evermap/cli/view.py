@@ -103,4 +103,4 @@ def _look_at(path: Path, save: Path | None, *, as_json: bool) -> None:
         scene = Path(folder) / f"{path.resolve().stem}.rrd"
         for remark in write_view(path, scene):
             warn(remark)
-        subprocess.run([sys.executable, "-m", "rerun", str(scene)], check=False)  # nosec  # B603: a file we have just made
+        subprocess.run([sys.executable, "-m", "rerun", str(scene)], check=False)  # noqa: S603  (a file we just made)

@@ -282,7 +282,7 @@ def _formulas(double: bool) -> dict[str, Any]:
 
     tree = _Selections().visit(ast.parse(Path(recursion.__file__).read_text(encoding="utf-8")))
     space: dict[str, Any] = {"__name__": recursion.__name__}
-    exec(compile(ast.fix_missing_locations(tree), recursion.__file__, "exec"), space)  # nosec  # B102: a module of ours
+    exec(compile(ast.fix_missing_locations(tree), recursion.__file__, "exec"), space)  # noqa: S102  (a module of ours)
     smallest, largest, log_largest = _bounds(double)
     space.update(
         SMALLEST=smallest, LARGEST=largest, LOG_LARGEST=log_largest, where=where, split=split,

@@ -102,7 +102,7 @@ class Spool:
         """Enter waiting sessions in a separate process, which prints a line of JSON for each."""
         command = [sys.executable, "-c", "import sys; from evermap.live.spool import _main; _main(*sys.argv[1:])"]
         quiet = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-        return subprocess.Popen(  # nosec  # B603: ourselves; no shell reads the name of the map
+        return subprocess.Popen(  # noqa: S603  (ourselves; no shell reads the name of the map)
             [*command, str(self.map_file)], stdout=subprocess.PIPE, text=True, env=quiet, stdin=subprocess.DEVNULL
         )
 

@@ -231,7 +231,7 @@ def _convert(files: dict[str, Path], out: Path) -> tuple[str, ...]:
     command += [f"--topics={name}" for name in settings]
     how: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 2 * _BAG_CPU_S}
     try:
-        done = subprocess.run(command, **how, check=False)  # nosec  # B603: ourselves, with files of names of ours
+        done = subprocess.run(command, **how, check=False)  # noqa: S603  (ourselves, with files of names of ours)
     except subprocess.TimeoutExpired:
         raise InputError(f"cannot be read as a bag within {2 * _BAG_CPU_S} s") from None
     if done.returncode == 2:

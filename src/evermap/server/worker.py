@@ -214,7 +214,7 @@ class Crew:
                 if self._over.is_set():
                     return
                 # in a session of its own: Ctrl-C is for the server, which ends its workers
-                process = subprocess.Popen(  # nosec  # B603: ourselves
+                process = subprocess.Popen(  # noqa: S603  (ourselves)
                     self._command, stdin=subprocess.DEVNULL, start_new_session=True
                 )
                 self._processes[place] = process

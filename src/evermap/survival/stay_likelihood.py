@@ -220,9 +220,11 @@ def _find_gone(leave: FloatArray, back: FloatArray, come: FloatArray) -> tuple[F
     """Return `_log_gone`, and its derivatives by the integrated hazard."""
     value = _log_gone(leave, back, come)
     leave = np.maximum(leave, TINY)
-    change = (1.0 + back) * leave + come
+    slope = 1.0 + back
+    change = slope * leave + come
     with np.errstate(all="ignore"):
         odds = 1.0 / np.expm1(np.minimum(change, 700.0))
-        d1 = 1.0 / leave - (1.0 + back) / change + (1.0 + back) * odds
-        d2 = -1.0 / leave**2 + ((1.0 + back) / change) ** 2 - (1.0 + back) ** 2 * odds * (1.0 + odds)
+        ratio, bend = slope / change, slope**2 * odds
+        d1 = 1.0 / leave - ratio + slope * odds
+        d2 = ratio**2 - 1.0 / leave**2 - bend * (1.0 + odds)
     return value, d1, d2

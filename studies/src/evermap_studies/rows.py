@@ -6,7 +6,7 @@ A study that is ended, in whatever way, goes on from them when it is started aga
 from __future__ import annotations
 
 import json
-import subprocess  # nosec  # B404: git of our own clone
+import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from os import SEEK_END
@@ -106,7 +106,7 @@ def commit_of_code() -> str | None:
     try:
         asked = (["show", "-s", "--abbrev=8", "--format=%h %cs", "HEAD"], ["status", "--porcelain", *SOURCES])
         head, changed = (
-            subprocess.run([*here, *one], capture_output=True, text=True, check=True).stdout  # nosec  # B603: as above
+            subprocess.run([*here, *one], capture_output=True, text=True, check=True).stdout  # noqa: S603  (git)
             for one in asked
         )
     except (OSError, subprocess.CalledProcessError):

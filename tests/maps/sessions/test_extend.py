@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from evermap.config import LivingConfig
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.extend import Extended, Found, extended
+from evermap.maps.sessions.extend import Extended, Found, extended, fellows_of
 from evermap.maps.sessions.gaussian import with_session
 from evermap.types import FloatArray
 
@@ -23,6 +23,15 @@ ALONE = LivingConfig(cliques=False)
 def some_covariance(random: np.random.Generator, points: int) -> FloatArray:
     factor = random.normal(size=(2 * points, 2 * points + 1)) * 0.02
     return np.asarray(factor @ factor.T)
+
+
+def test_a_fellow_is_on_the_body_that_most_of_its_object_are_of() -> None:
+    """Landmark 1 is of a body of its own, 2 and 3 of another; 5 is of an object that the map knows nothing of."""
+    living = begun(found([1, 2, 3], [[0, 0], [1, 0], [2, 0]])).living
+    members = replace(living.members, landmark_id=np.array([1, 2, 3]), clique_id=np.array([0, 1, 1]))
+    objects = np.array([[1, 8], [2, 8], [3, 8], [4, 8], [5, 9]])
+    fellow = fellows_of(np.array([4, 5, 6]), objects, replace(living, members=members))
+    np.testing.assert_array_equal(fellow, [2, -1, -1])
 
 
 def believing(entry: Extended) -> LivingMap:

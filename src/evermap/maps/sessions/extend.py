@@ -58,7 +58,8 @@ def fellows_of(landmark_id: IntArray, objects: IntArray, living: LivingMap) -> I
         theirs = np.flatnonzero(body == one)
         if len(theirs):
             name, count = np.unique(clique[theirs], return_counts=True)
-            found[k] = members.landmark_id[row[theirs[clique[theirs] == name[np.argmax(count)]][0]]]
+            of_most = theirs[clique[theirs] == name[np.argmax(count)]]
+            found[k] = members.landmark_id[row[of_most[0]]]
     return found
 
 

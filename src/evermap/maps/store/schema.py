@@ -135,7 +135,7 @@ def _records(connection: Connection) -> None:
 def _list_pruned(connection: Connection) -> None:
     """3 to 4: which revisions are pruned; the row of `store` is sealed anew, so it must be what was written."""
     columns = "schema_version, created_at, evermap_version, head, record, checksum"
-    for *values, sealed in connection.execute(text(f"SELECT {columns} FROM store")).all():  # nosec  # B608: ours
+    for *values, sealed in connection.execute(text(f"SELECT {columns} FROM store")).all():  # noqa: S608  (ours)
         if values[0] == 3 and sealed != checksum(*values):
             raise DamagedError("a checksum does not match: of the row that names the newest revision")
     connection.execute(text("ALTER TABLE store ADD COLUMN pruned TEXT"))
@@ -148,7 +148,7 @@ def _changes(connection: Connection, number: int) -> list[Any]:
     for position, landmark in connection.execute(listed, {"number": number}):
         named.setdefault(position, []).append(landmark)
     columns = "kind, stamp_from_s, stamp_to_s, dx_m, dy_m, rotation_rad, probability, n_hits, n_misses"
-    sql = f"SELECT position, {columns} FROM change WHERE revision = :number ORDER BY position"  # nosec  # B608: ours
+    sql = f"SELECT position, {columns} FROM change WHERE revision = :number ORDER BY position"  # noqa: S608  (ours)
     told = text(sql)
     rows = connection.execute(told, {"number": number})
     return [[kind, named.get(position, []), *numbers] for position, kind, *numbers in rows]
