@@ -87,3 +87,15 @@ def test_what_is_missed_from_few_positions_says_nothing() -> None:
     far = Landmarks.at([99], [[14.6, 4.0]])  # beyond a wall, in nominal view from the end of the field
     result = run_slam(recording, prior_map=survey.joined(far))
     assert not result.gone.landmark_id.size
+
+
+def test_where_some_tags_are_hardly_ever_read_one_that_is_not_read_may_be_there() -> None:
+    """Five of 16 tags are read in one of fifty looks, as glossy ones are. All are looked at as often as a usual tag."""
+    world, random = World(seed=9, seconds=60.0), np.random.default_rng(3)
+    recording = world.space(corners=False)
+    seen, rate = recording.detections, random.choice([1.0, 0.02], 16)
+    read = (random.random(len(seen)) < rate[seen.landmark_id]) & (seen.landmark_id != 3)
+    result = run_slam(replace(recording, detections=seen[read]), prior_map=world.map_in_space())
+    assert (np.bincount(seen.landmark_id[read], minlength=16) == 0).sum() == 3
+    assert result.misses.landmark_id.tolist().count(3) > 5
+    assert not result.gone.landmark_id.size
