@@ -27,7 +27,9 @@ EDGES = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 41))
 LEVELS = 100
 """Bins of what looks from a position are worth."""
 LEAST = 1e-300
+"""Likelihood, so that its logarithm is finite."""
 NOTHING = np.zeros(2)
+"""Positions that are believed beforehand."""
 
 
 class Positions(NamedTuple):

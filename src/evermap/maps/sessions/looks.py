@@ -564,7 +564,7 @@ def _list_flanked(watch: Watch, floor_m: FloatArray, near: BoolArray, settings: 
         ahead = floor_m[seen][None] - eye[listed.pose[looks], :2][:, None]
         turn = se2.wrap(np.arctan2(ahead[..., 1], ahead[..., 0]) - bearing[looks][:, None])
         in_front = np.hypot(ahead[..., 0], ahead[..., 1]) < settings.flank_share * range_m[looks][:, None]
-        beside = ~in_front & (np.abs(turn) < settings.flank_rad) & (seen != listed.landmark[looks][:, None])
+        beside = ~in_front & (np.abs(turn) < settings.flank_rad)
         flanked[looks] = (beside & (turn > 0.0)).any(axis=1) & (beside & (turn < 0.0)).any(axis=1)
     return flanked
 
