@@ -42,6 +42,8 @@ LOGITS = np.linspace(-60.0, 20.0, 801)
 FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
 positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
+NEVER = np.array([1e-9])
+"""Share of places that are in sight from nowhere, of those between others."""
 LEAST_P = 1e-3
 """Probability that something is gone which the session saw."""
 USUAL_RANGE = 0.9
@@ -525,7 +527,8 @@ def weigh_misses(
     hidden = np.geomspace(settings.p_always_hidden, 0.99, 20)
     at_first = settings.flanked_worth * np.array([1.0 - settings.p_flanked_hidden, settings.p_flanked_hidden])
     between = _by_position(watch, near, flanked, settings)
-    p_flanked = weigh_never_seen(between, unseen, hidden, settings.p_gone, at_first)
+    p_flanked = weigh_never_seen(between, unseen, NEVER, settings.p_gone, at_first)
+    p_flanked = np.maximum(p_flanked, settings.p_always_hidden)
     flanked &= unseen[listed.landmark]
     p_flanked[_is_one_sided(watch, floor_m, flanked, settings) & ~oriented] = 1.0
     in_the_open = _by_position(watch, near, near, settings)
