@@ -84,6 +84,8 @@ def test_each_position_that_misses_says_less_than_the_one_before() -> None:
         p.append(float(p_missed[1]))
     assert (np.diff(np.log(p)) < 0.0).all()
     assert (np.diff(np.log(p), 2) > 0.0).all()
+    bounded = RULES.model_copy(update={"p_always_hidden": 0.5})
+    assert weigh_misses(watched(eyes, places, seen), places, ~seen, ~seen, bounded)[1][1] == 0.5
 
 
 def test_few_looks_from_a_position_say_less_than_many() -> None:
@@ -128,7 +130,7 @@ def look_in_the_open(rates: FloatArray, positions: int, seed: int) -> tuple[Watc
     hit = shown[pose // FRAMES, place]
     eye[:, 1] = 0.2
     watch = Watch(np.arange(float(len(eye))), LooksAt(pose, place, np.full(len(pose), P_DETECT), hit), eye)
-    return watch, places, ~shown.any(axis=0)
+    return watch, places, np.asarray(~shown.any(axis=0))
 
 
 def test_a_landmark_is_not_gone_where_others_are_detected_seldom() -> None:
