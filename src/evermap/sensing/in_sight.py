@@ -88,8 +88,10 @@ def weigh_never_seen(
     count, (place, _, hit, counts) = len(unseen), seen
     looked, found, ever = (np.bincount(place[some], minlength=count) > 0 for some in (counts, counts & hit, hit))
     known, asked = ~unseen & looked & ever, unseen & looked
-    share, worth = 0.5 * (EDGES[1:] + EDGES[:-1]), (np.arange(LEVELS) + 0.5) / LEVELS
-    shown = worth[:, None] * share
+    number = np.bincount(seen.level, minlength=LEVELS)
+    worth = (np.bincount(seen.level, seen.worth, minlength=LEVELS) + 1e-9) / np.maximum(number, 1)  # mean of each bin
+    share = 0.5 * (EDGES[1:] + EDGES[:-1])
+    shown = np.minimum(worth, 1.0)[:, None] * share
     log_missed = np.log1p(-shown)
     a, b = (grid.ravel()[:, None] for grid in np.meshgrid(SHARES, SHARES))
     p_share = np.asarray(np.diff(betainc(a, b, EDGES), axis=1), dtype=np.float64)
