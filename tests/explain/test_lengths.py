@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from evermap import run_slam
-from evermap.maps.sessions import session
-from evermap.maps.sessions.looks import Watch, weigh_misses
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.types import ChangeKind, Landmarks, Recording, SlamResult
 
@@ -90,25 +87,3 @@ def test_what_is_missed_from_few_positions_says_nothing() -> None:
     far = Landmarks.at([99], [[14.6, 4.0]])  # beyond a wall, in nominal view from the end of the field
     result = run_slam(recording, prior_map=survey.joined(far))
     assert not result.gone.landmark_id.size
-
-
-def test_tags_that_are_hardly_ever_read_are_looked_at_as_often_as_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some tags are read in one of fifty looks, as glossy ones are. What misses say of another one is learned from all
-    looks at them, as at a usual tag.
-    """
-    world, random, watches = World(seed=8, seconds=60.0), np.random.default_rng(5), list[Watch]()
-
-    def weigh(watch: Watch, *rest: Any) -> Any:
-        watches.append(watch)
-        return weigh_misses(watch, *rest)
-
-    monkeypatch.setattr(session, "weigh_misses", weigh)
-    recording = world.space(corners=False)
-    seen, rate = recording.detections, random.choice([1.0, 0.02], 16)
-    read = (random.random(len(seen)) < rate[seen.landmark_id]) & (seen.landmark_id != 3)
-    result = run_slam(replace(recording, detections=seen[read]), prior_map=world.map_in_space())
-    assert not result.gone.landmark_id.size
-    listed = watches[-1].listed
-    rare = rate[listed.landmark] < 1.0
-    assert np.mean(listed.hit[rare]) < 0.1 < 0.7 < np.mean(listed.hit[~rare & (listed.landmark != 3)])
-    assert np.median(listed.p_detect[rare]) > 0.9 * np.median(listed.p_detect[~rare])

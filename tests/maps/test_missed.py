@@ -1,13 +1,15 @@
-"""Members of a body that are missed alone."""
+"""Members of a body that are missed alone, and places that are never seen."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import betaln
 
 from evermap.maps.bodies import without_missed
 from evermap.maps.living import LivingMap, Members, Places, Sites
+from evermap.maps.sessions.looks import _p_never_in_sight
 
 LANDMARKS = 10 + np.arange(4)
 OFF = np.zeros(4, np.bool_)
@@ -76,3 +78,16 @@ def test_a_first_session_leaves_bodies_as_they_are() -> None:
 
 def test_an_empty_map_stays_empty() -> None:
     assert len(without_missed(LivingMap(), LivingMap()).members) == 0
+
+
+def test_how_likely_a_place_is_in_sight_from_nowhere_is_learned_from_what_was_seen():
+    """Against the beta distribution that shares were drawn from, places that were never seen left out."""
+    rng = np.random.default_rng(2)
+    positions = rng.integers(5, 30, 600)
+    for a, b in ((2.0, 1.0), (12.0, 2.0)):
+        seen = rng.binomial(positions, rng.beta(a, b, len(positions)))
+        found = _p_never_in_sight(seen[seen > 0], positions[seen > 0], np.array([3, 8, 20]))
+        true = np.exp(betaln(a, b + np.array([3, 8, 20])) - betaln(a, b))
+        assert np.abs(np.log(found / true) / np.log(true)).max() < 0.12
+    few = _p_never_in_sight(seen[:5], positions[:5], np.array([20]))
+    assert few > found[2]  # five places say little

@@ -71,20 +71,6 @@ def test_a_whole_session_is_its_looks_each_confirmed():
     np.testing.assert_array_equal(start.hits, learned.init(landmark, each, start.profile).hits)  # not in place
 
 
-def test_a_usual_landmark_is_detected_as_one_of_which_the_sensor_has_learned_nothing():
-    rng = np.random.default_rng(4)
-    landmark, each = cliques(rng)[0], np.arange(34)
-    looks = list(frames(rng, 40, len(each)))
-    pose = np.tile(np.eye(4), (len(looks), 1, 1))
-    pose[:, :3, 3], pose[:, :3, :3] = [look[1] for look in looks], [look[2] for look in looks]
-    start = learned.init(landmark, each, Assumed(field=LIDAR))
-    detected = np.array([look[3] for look in looks])
-    model = learned.watched(start, np.array([look[0] for look in looks]), pose, detected, np.ones_like(detected))
-    usual = learned.with_usual_rates(model).p_detect(pose, landmark)
-    np.testing.assert_allclose(usual, learned.init(landmark, each, model.profile).p_detect(pose, landmark), rtol=1e-6)
-    assert np.abs(model.p_detect(pose, landmark) - usual).max() > 0.05
-
-
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_it_is_the_plain_model_frame_by_frame(name, seed):

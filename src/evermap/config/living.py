@@ -170,9 +170,8 @@ class LooksConfig(Section):
         1.0, "distance between positions from which something narrow hides different places [m]"
     )
     one_sided_rad: Positive = rule(2.1, "angle over which a landmark of unknown orientation must be missed [rad]")
-    p_flanked_hidden: Share = rule(0.05, "probability that it is not seen from one position all the same, at first")
-    flanked_worth: Positive = rule(5.0, "positions that this is worth")
-    p_always_hidden: Share = rule(0.003, "least share of places that are in sight from nowhere")
+    p_flanked_hidden: Share = rule(0.05, "probability that it is hidden from one position all the same")
+    p_always_hidden: Share = rule(0.003, "probability that it is hidden from all")
     p_gone: Share = rule(0.03, "probability that a landmark of a given map is nowhere")
 
 

@@ -327,11 +327,6 @@ def _frame(profile: Profile, place: FloatArray, turn: FloatArray) -> SensorFrame
     return SensorFrame(tuple(place.tolist()), tuple(turn.ravel().tolist()), limits)
 
 
-def with_usual_rates(model: LearnedDetection) -> LearnedDetection:
-    """Return the model of a sensor that has learned nothing of any one landmark: all are detected alike."""
-    return replace(model, hits=np.ones_like(model.hits), expected=np.ones_like(model.expected))
-
-
 def watched(
     model: LearnedDetection,
     stamp_s: FloatArray,

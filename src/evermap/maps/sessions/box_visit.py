@@ -168,12 +168,12 @@ class BoxVisit(SpatialVisit):
         number = np.where(mine, np.arange(len(mine)), UNKNOWN)
         return replace(found, rotation_covariance=spread, object_id=number)
 
-    def watched(self, entry: Extended, config: LivingConfig, *, own_rates: bool = True) -> Watch:
+    def watched(self, entry: Extended, config: LivingConfig) -> Watch:
         """Return what was looked at: a detection that is of no stay may show a box of the map all the same, and what
         another box hides was not looked at.
         """
         settings = config.boxes
-        watch = self.witnessed.unlooked(super().watched(entry, config, own_rates=own_rates), entry)
+        watch = self.witnessed.unlooked(super().watched(entry, config), entry)
         recording, listed = self.taken.recording, watch.listed
         frame = np.searchsorted(recording.frames.stamp_s, watch.stamp_s - 1e-3)
         rows, at = self._detected()

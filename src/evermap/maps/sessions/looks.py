@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betaln
 
 from evermap.config import LivingConfig, LooksConfig, SightConfig
 from evermap.existence.sites import SiteLooks
@@ -30,7 +31,6 @@ from evermap.geometry import se2
 from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
 from evermap.maps.sessions.extend import first_and_last
 from evermap.maps.sessions.open_space import NewLooks, OpenSpace, Rays, count_sides, weigh_new_lines
-from evermap.sensing.in_sight import Positions, weigh_never_seen
 from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets, session_rate
 from evermap.sensing.visibility import LooksAt, NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
@@ -42,12 +42,14 @@ LOGITS = np.linspace(-60.0, 20.0, 801)
 FEWEST = 5
 """Places that were seen, from which it is learned from how much of where they are in view places are in sight; and
 positions from which a place must have been missed, since what hides it from one hides it from others nearby."""
-NEVER = np.array([1e-9])
-"""Share of places that are in sight from nowhere, of those between others."""
 LEAST_P = 1e-3
 """Probability that something is gone which the session saw."""
+SHARES = np.geomspace(0.25, 64.0, 25)
+"""Parameters of the beta distribution of that share which are weighed, all alike (both are a number of positions)."""
 USUAL_RANGE = 0.9
 """Share of the detections within whose range a miss says something: data sheets promise more."""
+EXPECTED = 1.5
+"""Detections that one position must lead to expect, or its misses are chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -509,76 +511,109 @@ def weigh_misses(
     """Return which looks at places that were never detected count as misses, and (P,) how probable all of them are if
     something stands there: between detections of others, or in the open, whichever says more of a place.
 
-    From which share of the positions a landmark is detected is another for each, as what was detected says
-    (`in_sight`). Between others nothing but what is narrow hides a place; in the open some are in sight from nowhere,
-    behind walls or in rooms that were not entered, and where much of a map was not seen, it is not all gone.
-
     Args:
-        watch: looks of a session; probabilities of detection are those of a usual landmark.
+        watch: looks of a session.
         floor_m: (P, 2) places.
         unseen: (P,) whether a place was never detected.
         oriented: (P,) whether the looks know to where it faces.
         settings: what counts.
     """
-    listed, count = watch.listed, len(floor_m)
+    listed = watch.listed
     range_m = np.linalg.norm(floor_m[listed.landmark] - watch.eye[listed.pose, :2], axis=1)
     near = range_m <= (np.quantile(range_m[listed.hit], USUAL_RANGE) if listed.hit.any() else 0.0)
-    flanked = _list_flanked(watch, floor_m, near, settings)
-    hidden = np.geomspace(settings.p_always_hidden, 0.99, 20)
-    at_first = settings.flanked_worth * np.array([1.0 - settings.p_flanked_hidden, settings.p_flanked_hidden])
-    between = _by_position(watch, near, flanked, settings)
-    p_flanked = weigh_never_seen(between, unseen, NEVER, settings.p_gone, at_first)
-    p_flanked = np.maximum(p_flanked, settings.p_always_hidden)
-    flanked &= unseen[listed.landmark]
-    p_flanked[_is_one_sided(watch, floor_m, flanked, settings) & ~oriented] = 1.0
-    in_the_open = _by_position(watch, near, near, settings)
-    enough = np.bincount(in_the_open.place, minlength=count) >= FEWEST
-    p_open = np.ones(count)
-    if np.count_nonzero(~unseen & (np.bincount(in_the_open.place, in_the_open.hit, minlength=count) > 0)) >= FEWEST:
-        p_open = np.where(enough, weigh_never_seen(in_the_open, unseen, hidden, settings.p_gone), 1.0)
-    open_says_more = (unseen & (p_open < p_flanked))[listed.landmark]
-    return flanked | (near & open_says_more), np.minimum(p_flanked, p_open)
+    flanked, p_flanked = _misses_between_others(watch, floor_m, unseen, oriented, near, settings)
+    in_the_open, p_open = _misses_in_the_open(watch, len(floor_m), unseen, near, settings)
+    flanked |= in_the_open & (p_open < p_flanked)[listed.landmark]
+    return flanked, np.minimum(p_flanked, p_open)
 
 
-def _by_position(watch: Watch, near: BoolArray, counts: BoolArray, settings: LooksConfig) -> Positions:
-    """Return looks that are `near`, by the position from which they were taken; those that count are some of them."""
-    listed = watch.listed.rows(near)
-    cell = np.floor(watch.eye[listed.pose, :2] / settings.elsewhere_m).astype(np.int64)
-    return Positions.of(listed.landmark, cell, listed.p_detect, listed.hit, counts[near], settings.sticky)
+def _misses_between_others(
+    watch: Watch, floor_m: FloatArray, unseen: BoolArray, oriented: BoolArray, near: BoolArray, settings: LooksConfig
+) -> tuple[BoolArray, FloatArray]:
+    """Return which looks at places that were never detected lie between detections of others, and (P,) how probable all
+    these misses are if something stands there.
 
+    A look between what is seen on both sides of it from nearby, at no less than a share of its range, is blocked by
+    something narrow only. From several positions that is improbable, unless the place is hidden from all.
 
-def _list_flanked(watch: Watch, floor_m: FloatArray, near: BoolArray, settings: LooksConfig) -> BoolArray:
-    """Return which looks (N,) of those that are `near` lie between detections of other places from nearby, on both
-    sides and at no less than a share of their range: what is missed so is behind something narrow, if it is there.
+    Looks that count are `near`, (N,).
     """
     listed, eye = watch.listed, watch.eye
     away = floor_m[listed.landmark] - eye[listed.pose, :2]
     range_m, bearing = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     flanked = np.zeros(len(listed.pose), dtype=np.bool_)
-    asked = np.flatnonzero(near)
+    asked = np.flatnonzero(unseen[listed.landmark] & near)
     half = np.floor(2.0 * eye[:, :2] / settings.elsewhere_m).astype(np.int64)
     hits = np.unique(np.column_stack([half[listed.pose[listed.hit]], listed.landmark[listed.hit]]), axis=0)
-    cells, of = np.unique(half[listed.pose[asked]], axis=0, return_inverse=True)
-    by_cell = np.argsort(of.ravel(), kind="stable")
-    first = np.searchsorted(of.ravel()[by_cell], np.arange(len(cells) + 1))
-    for k, cell in enumerate(cells):
-        looks = asked[by_cell[first[k] : first[k + 1]]]
+    for cell in np.unique(half[listed.pose[asked]], axis=0):
+        looks = asked[(half[listed.pose[asked]] == cell).all(axis=1)]
         seen = np.unique(hits[(np.abs(hits[:, :2] - cell) <= 1).all(axis=1), 2])
         ahead = floor_m[seen][None] - eye[listed.pose[looks], :2][:, None]
         turn = se2.wrap(np.arctan2(ahead[..., 1], ahead[..., 0]) - bearing[looks][:, None])
         in_front = np.hypot(ahead[..., 0], ahead[..., 1]) < settings.flank_share * range_m[looks][:, None]
         beside = ~in_front & (np.abs(turn) < settings.flank_rad)
         flanked[looks] = (beside & (turn > 0.0)).any(axis=1) & (beside & (turn < 0.0)).any(axis=1)
-    return flanked
-
-
-def _is_one_sided(watch: Watch, floor_m: FloatArray, some: BoolArray, settings: LooksConfig) -> BoolArray:
-    """Return which places (P,) some looks see from one side only: what faces another way may be there."""
-    listed = watch.listed
-    away = floor_m[listed.landmark] - watch.eye[listed.pose, :2]
-    bearing, one_sided = np.arctan2(away[:, 1], away[:, 0]), np.zeros(len(floor_m), dtype=np.bool_)
-    for place in np.unique(listed.landmark[some]).tolist():
-        around = np.sort(bearing[some & (listed.landmark == place)])
+    p_missed = np.ones(len(floor_m))
+    for place in np.unique(listed.landmark[flanked]).tolist():
+        rows = np.flatnonzero(flanked & (listed.landmark == place))
+        around = np.sort(bearing[rows])
         gap = np.diff(np.append(around, around[0] + 2.0 * np.pi)).max()
-        one_sided[place] = 2.0 * np.pi - gap < settings.one_sided_rad
-    return one_sided
+        if not oriented[place] and 2.0 * np.pi - gap < settings.one_sided_rad:
+            continue  # it may be seen from another side only
+        position = np.floor(eye[listed.pose[rows], :2] / settings.elsewhere_m)
+        cell = np.unique(position, axis=0, return_inverse=True)[1].ravel()
+        expected = np.bincount(cell, listed.p_detect[rows])
+        log_missed = np.bincount(cell, np.log1p(-np.minimum(listed.p_detect[rows], 0.99)))[expected >= EXPECTED]
+        each = settings.p_flanked_hidden + (1.0 - settings.p_flanked_hidden) * np.exp(log_missed)
+        p_missed[place] = max(float(np.prod(each)), settings.p_always_hidden)
+    return flanked, p_missed
+
+
+def _misses_in_the_open(
+    watch: Watch, count: int, unseen: BoolArray, near: BoolArray, settings: LooksConfig
+) -> tuple[BoolArray, FloatArray]:
+    """Return which looks at places that were never detected count, and (P,) how probable all these misses are if
+    something stands there that is in sight from as many positions as what was seen.
+
+    From which share of the positions in whose nominal view it lies a place is in sight, is another for each: beta
+    distributed, as what was seen says, each of it known to be in sight at least once (a beta-binomial, truncated at
+    zero). Besides, some places are in sight from nowhere, behind walls or in rooms that were not entered. How many is
+    learned, too: where much of a map was not seen, it is not all gone. What a place itself says does not count for it.
+
+    Looks that count are `near`, (N,), at `count` places.
+    """
+    listed = watch.listed.rows(near)
+    position = np.floor(watch.eye[listed.pose, :2] / settings.elsewhere_m).astype(np.int64)
+    cells, cell = np.unique(np.column_stack([listed.landmark, position]), axis=0, return_inverse=True)
+    expected = np.bincount(cell.ravel(), listed.p_detect, minlength=len(cells))
+    hit = np.bincount(cell.ravel(), listed.hit, minlength=len(cells)) > 0
+    of = cells[:, 0][looked := (expected >= EXPECTED) | hit]
+    n, x = np.bincount(of, minlength=count), np.bincount(of, hit[looked], minlength=count)
+    known = ~unseen & (x > 0)
+    asked = unseen & (n >= FEWEST)
+    p_missed = np.ones(count)
+    if np.count_nonzero(known) >= FEWEST and asked.any():
+        by_chance = _p_never_in_sight(x[known], n[known], n[asked])
+        hidden = np.geomspace(settings.p_always_hidden, 0.99, 40)[:, None]
+        missed = hidden + (1.0 - hidden) * by_chance  # (H, A) of what stands there
+        each = np.log(settings.p_gone + (1.0 - settings.p_gone) * missed)
+        rest = each.sum(axis=1, keepdims=True) - each
+        fit = rest + np.count_nonzero(known) * np.log1p(-hidden) - 0.5 * np.log(hidden)
+        weight = np.exp(fit - fit.max(axis=0))
+        p_missed[asked] = (weight * missed).sum(axis=0) / weight.sum(axis=0)
+    return near & asked[watch.listed.landmark], np.maximum(p_missed, settings.p_always_hidden)
+
+
+def _p_never_in_sight(seen: IntArray, of_seen: IntArray, positions: IntArray) -> FloatArray:
+    """Return (A,) how probable it is that a place that is in view from so many positions (A,) is in sight from none.
+
+    Args:
+        seen: (K,) positions from which each of some places was seen, at least one.
+        of_seen: (K,) positions from which it was in view.
+        positions: (A,) those of the places that are asked for.
+    """
+    a, b = (grid.ravel()[:, None] for grid in np.meshgrid(SHARES, SHARES))
+    none = np.exp(betaln(a, b + of_seen) - betaln(a, b))
+    fit = betaln(a + seen, b + of_seen - seen) - betaln(a, b) - np.log1p(-np.minimum(none, 1.0 - 1e-12))
+    weight = np.exp(fit.sum(axis=1) - fit.sum(axis=1).max())
+    return np.asarray((weight / weight.sum()) @ np.exp(betaln(a, b + positions) - betaln(a, b)))

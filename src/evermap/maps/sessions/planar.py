@@ -100,10 +100,8 @@ class PlanarVisit:
             fellow=fellows_of(names, visit.recording.objects, living),
         )  # fmt: skip
 
-    def watched(self, entry: Extended, config: LivingConfig, *, own_rates: bool = True) -> Watch:  # noqa: ARG002
-        """Return at which places of the map the session looked, by the nominal field of view; that knows no rates of
-        single landmarks.
-        """
+    def watched(self, entry: Extended, config: LivingConfig) -> Watch:
+        """Return at which places of the map the session looked, by the nominal field of view."""
         visit = self.solved
         recording, prepared = visit.recording, visit.prepared
         stamps = recording.frames.stamp_s

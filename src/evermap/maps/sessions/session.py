@@ -328,7 +328,7 @@ def looked_for(visit: Visit, slam: SlamResult, given: Landmarks, config: LivingC
     site = living.sites.site_id[np.searchsorted(both.landmark_id, found.landmark_id)]
     place = living.place_row(found.landmark_id, site)
     entry = Extended(living, living, found.landmark_id, place, living.sites.p_here, none)
-    watch = visit.watched(entry, config, own_rates=False)
+    watch = visit.watched(entry, config)
     names, floor_m = living.places.landmark_id, np.ascontiguousarray(living.places.position_m[:, :2])
     asked = np.isin(names, unseen.landmark_id)
     oriented = np.zeros(len(names), dtype=np.bool_) if rotation is None else np.isfinite(living.places.rotation[:, 0])

@@ -214,12 +214,11 @@ class SpatialVisit:
                 found[k] = alike.kinds[alike.of[k]].nearest(found[k], np.append(np.zeros(3), known[-1]))
         return found[:, 3:]
 
-    def watched(self, entry: Extended, config: LivingConfig, *, own_rates: bool = True) -> Watch:
+    def watched(self, entry: Extended, config: LivingConfig) -> Watch:
         """Return at which places of the map the session looked: where its own sightings show that it would have seen
         them.
 
-        The detection by range, incidence and direction is learned from what stood (`sensing.learned`). Without
-        `own_rates` it is that of a usual landmark at each place.
+        The detection by range, incidence and direction is learned from what stood (`sensing.learned`).
         """
         eye, which, stamp_s, hits = self._views(entry, config)
         places, axes = entry.living.places, self._axes
@@ -235,7 +234,6 @@ class SpatialVisit:
             some = mine[:: max(1, len(mine) // MOST_VIEWS)]
             chosen = np.isin(mine, some)
             model = learned.watched(model, stamp_s[some], pose[some], detected[some], there[chosen])
-            model = model if own_rates else learned.with_usual_rates(model)
             p[mine] = model.p_detect(pose[mine], places.position_m)
         looked = detected | (p >= config.looks.worth_a_look * p.max(initial=0.0))
         view, place = map(np.ascontiguousarray, np.nonzero(looked))
