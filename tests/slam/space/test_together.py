@@ -15,7 +15,7 @@ from evermap.estimate.sparse.system import exhaust
 from evermap.geometry import se3
 from evermap.maps.sessions.spatial import solve_visit
 from evermap.metrics.summary import compare_with_truth
-from evermap.slam.space.together import SolvedRobot, _lay_together, align_robots
+from evermap.slam.space.together import SolvedRobot, _lay_together, align_robots, solve_space_together
 from evermap.types import Frames, SpatialRecording, rows_of
 from evermap_studies.causes.drives import MAKES, SITES, as_recording, simulate
 
@@ -73,16 +73,16 @@ def test_robots_that_see_corners_lose_none_where_their_frames_meet_to_within_cen
     make = MAKES["corners"]
     site = SITES[make.site](np.random.default_rng([1, 99]))
     monkeypatch.setitem(SITES, make.site, lambda _: site)
-    robots = {number: as_recording(simulate(make, 1000 * number + 1, in_map=False)) for number in (1, 2)}
-    together, alone = run_together(robots), run_slam(robots[2])
-    for result in together.values():
-        assert np.mean(result.innovations.p_inlier < 0.5) < 0.005
-        sigma_px = next(one.value for one in result.parameters if one.name == "sigma_corner_px")
-        assert sigma_px == pytest.approx(0.3, rel=0.05)
-    sigma_m = [
-        np.median(np.trace(one.landmarks.covariance_m2, axis1=1, axis2=2)) ** 0.5 for one in (together[2], alone)
-    ]
-    assert 0.3 < sigma_m[0] / sigma_m[1] < 1.0
+    robots = [as_recording(simulate(make, 1000 * number + 1, in_map=False)) for number in (1, 2)]
+    visits = [solve_visit(robot, Config(), None, ()) for robot in robots]
+    members = [SolvedRobot(visit.intake, visit.solved) for visit in visits]
+    together = [one.optimum for one in solve_space_together(members, ["first", "second"], LocalizeConfig())]
+    for joint, visit in zip(together, visits, strict=True):
+        assert np.mean(joint.now.weight < 0.5) < 0.005
+        assert joint.noise.pixel == pytest.approx(0.3, rel=0.05)
+        np.testing.assert_array_equal(joint.smoother.problem.share, visit.optimum.smoother.problem.share)
+        np.testing.assert_array_equal(joint.last[0].problem.share, 1.0)
+    assert any((joint.smoother.problem.share < 0.5).all() for joint in together)
 
 
 def test_covariances_are_those_of_a_dense_inverse():
