@@ -11,6 +11,7 @@ import pytest
 
 from evermap import pipeline
 from evermap.config import Config
+from evermap.explain.trial import share_rejected
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions import solve
 from evermap.maps.sessions.session import Session, without_doubted
@@ -65,13 +66,9 @@ def test_a_session_by_corners_is_as_exact_in_a_map_as_by_itself(monkeypatch: pyt
     first, second = (as_recording(simulate(make, seed, in_map=False)) for seed in (1000, 2000))
     begun, alone = run_session(first), run_session(second)
     entered = run_session(second, begun.living)
-    assert rejected(entered) <= rejected(alone) + 0.002
+    assert share_rejected(entered.slam) <= share_rejected(alone.slam) + 0.002
     assert sigma_px(entered) == pytest.approx(sigma_px(alone), rel=0.03)
     assert np.median(entered.living.covariance_m2.diagonal()) < np.median(begun.living.covariance_m2.diagonal())
-
-
-def rejected(session: Session) -> float:
-    return float(np.mean(session.slam.innovations.p_inlier < 0.5))
 
 
 def sigma_px(session: Session) -> float:

@@ -18,7 +18,7 @@ from evermap.geometry import se2, se3
 from evermap.slam.changes.evidence import WindowEvidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import PLACES, POINTS
-from evermap.slam.space.estimate import SpatialOptimum, converge
+from evermap.slam.space.estimate import SpatialOptimum, converge, with_worth
 from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
 from evermap.slam.space.range_errors import consider_range_errors, find_range_errors, shows_errors
 from evermap.types import FloatArray, IntArray
@@ -172,7 +172,7 @@ def _measure_shared_errors(optimum: SpatialOptimum) -> FloatArray:
 def _predict_places(optimum: SpatialOptimum) -> MapComparison:
     """Predict every place of the map from the others and the session; none is judged yet."""
     problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
-    optimum = _with_worth(optimum)
+    optimum = with_worth(optimum)
     spread = optimum.smoother.spread(optimum.now)
     misread = _log_misread(optimum)
     count, n = len(prior.place), len(problem.stamp_s)
@@ -208,15 +208,6 @@ def _judge_places(
         odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
     return replace(found, p_stands=p_stands)
-
-
-def _with_worth(optimum: SpatialOptimum) -> SpatialOptimum:
-    """Return the same values with each detection counted as what it is worth beside others of its place."""
-    smoother = optimum.smoother.counted(optimum.estimate, optimum.now)
-    if smoother is optimum.smoother:
-        return optimum
-    now = smoother.linearised(optimum.estimate, optimum.noise, heavy=False)
-    return replace(optimum, smoother=smoother, now=now)
 
 
 def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: FloatArray) -> float:

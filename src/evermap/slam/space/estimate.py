@@ -106,9 +106,9 @@ def with_worth(
         share: (M,) of their information that is new, as of `SpatialSmoother.counted`.
         sober: levels that covariances are of; None for those of the optimum.
     """
-    smoother = optimum.smoother.counted(optimum.estimate, optimum.now, share)
-    sober = optimum.noise if sober is None else sober
-    now = smoother.linearised(optimum.estimate, sober, heavy=False)
+    smoother, now = optimum.smoother.counted(optimum.estimate, optimum.now, share), optimum.now
+    if sober is not None or smoother is not optimum.smoother:
+        now = smoother.linearised(optimum.estimate, optimum.noise if sober is None else sober, heavy=False)
     return replace(optimum, smoother=smoother, now=now, fitted=(optimum.smoother, optimum.now), sober=sober)
 
 
