@@ -4,6 +4,7 @@
     python -m benchmarks.yard --seeds 10 --points # tags without orientations
     python -m benchmarks.yard --seeds 5 --map     # three days in a living map
     python -m benchmarks.yard --seeds 5 --bodies boxes    # found by boxes around forklifts, not stated; or by motion
+    python -m benchmarks.yard --seeds 10 --first 20 --owners  # which tags are found to be on bodies, by each evidence
 
 Four runs a seed: all forklifts drive and stop; the same yard standing; and both without what is on them. All have the
 same noise, of a tag in a frame and of the odometry: with draws of their own the yards with walls only differ by a half.
@@ -15,6 +16,9 @@ that moves is then that with the statement. What is reported of boxes themselves
 
 In a living map two forklifts drive in each of three drives, and four are parked elsewhere each time; or all stands. A
 statement is false if it is of a wall, of what stands, or of two forklifts; and of one forklift there is one.
+
+With `--owners` nothing is solved: of the tags that were seen on forklifts it counts those found to be on a body,
+and the bodies that are wrong, with a tag of a wall or of two forklifts.
 """
 
 from __future__ import annotations
@@ -27,8 +31,9 @@ import numpy as np
 import evermap as em
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
-from evermap.types import UNKNOWN, ChangeKind, MapChange, SlamResult, rows_of
-from evermap_studies.worlds.yard import SENSOR_HEIGHT_M, STEP_S, YardConfig, YardDrive, simulate_yard
+from evermap.slam.ownership import find_owned
+from evermap.types import UNKNOWN, AnyRecording, ChangeKind, MapChange, SlamResult, rows_of
+from evermap_studies.worlds.yard import SENSOR_HEIGHT_M, STEP_S, YardConfig, YardDrive, flatten, simulate_yard
 
 BODIES = "stated", "boxes", "motion"
 """How it is known which tags are on one forklift."""
@@ -126,6 +131,36 @@ def _bodies_of(change: MapChange, drive: YardDrive) -> set[int]:
     return found if len(known) == len(change.landmark_ids) else {*found, -1}
 
 
+def count_owned(drive: YardDrive, recording: AnyRecording) -> list[int]:
+    """Return numbers of tags seen on forklifts, of those that are found to be on bodies, and of wrong bodies."""
+    seen = np.unique(drive.recording.detections.landmark_id)
+    seen = seen[seen != UNKNOWN]
+    found = find_owned(recording, em.Config())
+    forklift = drive.body_of_tag[found.landmark_id]
+    groups = [set(forklift[found.object_id == one].tolist()) for one in np.unique(found.object_id)]
+    wrong = sum(len(one) > 1 or -1 in one for one in groups)
+    return [int((drive.body_of_tag[seen] >= 0).sum()), int((forklift >= 0).sum()), wrong]
+
+
+def find_owners(usual: YardConfig, seeds: range) -> None:
+    """Print which tags are found to be on bodies, in space and in the plane, where boxes cannot be."""
+    usual = replace(usual, stated=False, boxed=False)
+    yards = {
+        "nothing": usual,
+        "boxes": replace(usual, boxed=True),
+        "masks": replace(usual, masked="image", walls_masked=True),
+    }
+    print("beside motion  in     seen  found  wrong bodies")
+    for name, config in yards.items():
+        drives = [simulate_yard(config, seed)[0] for seed in seeds]
+        spaces = {"space": [one.recording for one in drives]}
+        if name != "boxes":
+            spaces["plane"] = [flatten(one.recording) for one in drives]
+        for space, recordings in spaces.items():
+            counts = np.sum([count_owned(*one) for one in zip(drives, recordings, strict=True)], axis=0)
+            print(f"{name:13s}  {space}  {counts[0]:4d}  {counts[1]:5d}  {counts[2]:5d}")
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -135,17 +170,19 @@ def main() -> None:
     parser.add_argument("--wall-tags", type=int, default=YardConfig().wall_tags)
     parser.add_argument("--bodies", choices=BODIES, default="stated", help="who says which tags are on one forklift")
     parser.add_argument("--map", action="store_true", help="days in a living map")
+    parser.add_argument("--owners", action="store_true", help="which tags are found to be on bodies")
     asked = parser.parse_args()
     usual = YardConfig(
         moving=6, parked=0, oriented=not asked.points, wall_tags=asked.wall_tags, stated=asked.bodies == "stated",
         boxed=asked.bodies == "boxes",
     )  # fmt: skip
-    if asked.map:
-        enter_drives(usual, range(asked.first, asked.first + asked.seeds))
+    seeds = range(asked.first, asked.first + asked.seeds)
+    if asked.map or asked.owners:
+        (enter_drives if asked.map else find_owners)(usual, seeds)
         return
     rows = []
     print("seed  standing  moving  without: moving  standing  changes  false  verdicts")
-    for seed in range(asked.first, asked.first + asked.seeds):
+    for seed in seeds:
         moving, standing = (simulate_yard(replace(usual, standing=still), seed)[0] for still in (False, True))
         moving, standing = (with_noise(one, standing, usual, seed) for one in (moving, standing))
         drives = standing, moving, keep_walls(moving), keep_walls(standing)
