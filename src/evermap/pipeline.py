@@ -178,20 +178,31 @@ def _leave_out_carried(
     case: _Case, result: SlamResult, solution: SessionSolution[Visit]
 ) -> tuple[_Case, SlamResult, SessionSolution[Visit], tuple[Cause, ...]]:
     """Return case, result and solution without landmarks that are carried about, where there are any, and which."""
-    from evermap.explain.carried import find_carried, name_carried
+    from evermap.explain.carried import Carried, find_carried, name_carried
     from evermap.slam.votes import without_identities
 
+    def find(result: SlamResult, solution: SessionSolution[Visit]) -> tuple[Carried, ...]:
+        return find_carried(result, _with_read_names(solution.asked.inputs.recording, case.read), case.prior_map)
+
     as_given = case, result, solution, ()
-    if case.config.slam.unknown_ids is True or not (suspects := find_carried(result, case.read, case.prior_map)):
+    if case.config.slam.unknown_ids is True or not (suspects := find(result, solution)):
         return as_given
     names = tuple(one.landmark_id for one in suspects)
     rest, read = without_identities(case.recording, names), without_identities(case.read, names)
     without = replace(case, recording=rest, read=read, left_out=names)
     result, solution = _conclude(without)
-    confirmed = find_carried(result, case.read, case.prior_map)  # along poses that they do not bend
+    confirmed = find(result, solution)  # along poses that they do not bend
     if tuple(one.landmark_id for one in confirmed) != names:
         return as_given
     return without, result, solution, tuple(name_carried(one, case.read) for one in confirmed)
+
+
+def _with_read_names(recording: AnyRecording, read: AnyRecording) -> AnyRecording:
+    """Return a recording as it was put right (its stamps, axes, signs), with the identities that were read."""
+    if len(recording.detections) != len(read.detections):
+        return read
+    named = replace(recording.detections, landmark_id=read.detections.landmark_id)
+    return replace(recording, detections=named)
 
 
 def _without_changes(config: Config) -> Config:

@@ -17,6 +17,9 @@ from evermap.explain.expectations import find_instants, find_poses_at, locate_de
 from evermap.geometry import se2
 from evermap.slam.plane import in_its_space
 from evermap.types import UNKNOWN, AnyRecording, ParameterEstimate, SlamResult, VerdictKind
+from evermap_studies.causes.catalogue import catalogue
+from evermap_studies.causes.drives import as_recording
+from evermap_studies.causes.judge import make_case
 
 from .worlds import World
 
@@ -285,6 +288,27 @@ def test_ranges_that_are_off_carry_nothing_about(change: dict[str, float]) -> No
     read_m = change.get("bias_m", 0.0) + (1.0 + change.get("slope", 0.0)) * seen.range_m
     result = run_slam(replace(given, detections=replace(seen, range_m=read_m)), prior_map=given.true_landmarks)
     assert CARRIED not in list_codes(result)
+
+
+def test_a_clock_that_is_put_right_carries_nothing_about() -> None:
+    """At the stamps that were given the robot is .2 s on, and a landmark aside is seen at many places."""
+    world = next(one for one in catalogue() if one.name == "laser in a map: sensor 0.2 s late")
+    given = make_case(replace(world, make=replace(world.make, duration_s=40.0)), 4).given
+    result = run_slam(as_recording(given), prior_map=given.places)
+    assert list_codes(result) == ["clock"]
+    assert result.causes[0].value == pytest.approx(0.2, abs=0.01)
+
+
+def test_what_is_carried_about_is_found_by_axes_that_are_put_right() -> None:
+    given = make_plane()
+    wrong = carry(given, wander)
+    mirrored = replace(wrong, detections=replace(wrong.detections, bearing_rad=-wrong.detections.bearing_rad))
+    result = run_slam(mirrored, prior_map=given.true_landmarks)
+    assert [(cause.code, cause.subject) for cause in result.causes] == [
+        ("bearing-sign", "bearing_rad"),
+        (CARRIED, str(NAME)),
+    ]
+    assert not result.changes
 
 
 def test_detections_are_where_the_estimated_sensor_read_them() -> None:
