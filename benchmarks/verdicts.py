@@ -449,7 +449,8 @@ def scores(recording: AnyRecording, result: SlamResult, given: Landmarks | None)
     """Return errors by the truth: None where there is none."""
     rate_hz = 20.0 if is_in_space(recording) else 2.0
     compared = compare_with_truth(recording, result, rate_hz=rate_hz)
-    found, places, poses = metrics_dict(compared), compared.landmarks or compared.landmarks_own, compared.poses
+    found, poses = metrics_dict(compared), compared.poses
+    places = compared.landmarks_anchored or compared.landmarks_own  # in the frame that their covariances hold in
     names = ("pose_rmse_m", "dead_reckoning_rmse_m", "landmark_rmse_m", "heading_rmse_deg")
     row = {name: found[name] for name in names}
     row["pose_nees"] = None if poses is None else _typical(poses.nees, poses.dof)
