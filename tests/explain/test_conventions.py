@@ -467,7 +467,7 @@ def test_a_sensor_that_sits_where_it_is_stated_stays(world: World) -> None:
 
 
 def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone() -> None:
-    recording = with_ranges_alone(with_sensor_at(World(seed=6).plane(), 0.2))
+    recording = with_ranges_alone(with_sensor_at(World(seed=6, seconds=40.0).plane(), 0.2))
     driven = recording.odometry
     wrong = replace(recording, odometry=replace(driven, forward_mps=-driven.forward_mps))
     (cause,) = run_slam(wrong).causes
