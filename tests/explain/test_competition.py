@@ -680,7 +680,7 @@ def test_a_delay_that_no_score_reaches_is_shown_by_pairs_of_sightings(kind: str,
     assert find_delay(pairs, USUAL) == pytest.approx(late_s, abs=0.05)
 
 
-@pytest.mark.parametrize("late_s", [3.0, -2.0])
+@pytest.mark.parametrize("late_s", [3.0, pytest.param(-2.0, marks=pytest.mark.slow)])
 def test_a_clock_that_is_seconds_off_is_named_as_late_as_it_is(late_s: float) -> None:
     recording, _ = recorded(World(seed=10), "plane")
     late = replace(recording.frames, stamp_s=recording.frames.stamp_s + late_s)
