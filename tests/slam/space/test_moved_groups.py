@@ -57,7 +57,6 @@ def test_a_shelf_with_four_tags_moved_as_one(seed, odometry, points, turn):
     assert change.rotation_rad == pytest.approx(np.linalg.norm(turn), abs=0.03)
 
 
-@pytest.mark.slow
 def test_without_odometry_no_group_is_told():
     """The frames that see a part of a map alone may as well be elsewhere: each place is asked by itself."""
     world = tagged_corridor(3, odometry=False)
