@@ -139,7 +139,6 @@ def test_odometry_with_the_stamps_of_all_frames_may_be_late_by_half_a_step(lag_s
     assert (result.verdict.kind is VerdictKind.SOUND) == (lag_s != 0.2)
 
 
-@pytest.mark.slow
 def test_late_detections_are_compared_with_poses_of_when_they_were_taken():
     """At their stamps the robot is .2 m farther: halves of a right solution differed by 13 % of the range."""
     off, usual = (np.median(compare_detections(*solve(late_s, 0.1)).misfit) for late_s in (0.2, 0.0))
