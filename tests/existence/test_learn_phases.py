@@ -136,7 +136,6 @@ def test_rates_are_recovered() -> None:
     assert (np.abs(np.mean(logs, axis=0)) < 3.0 * scatter / np.sqrt(10.0)).all()
 
 
-@pytest.mark.slow
 def test_three_phases_are_recovered() -> None:
     """Away for long, away briefly, there: at once the structure is chosen and its rates are found."""
     rates = np.array([[0.0, 0.0, 1 / 4000.0], [0.0, 0.0, 1 / 40.0], [1 / 2000.0, 1 / 300.0, 0.0]])
