@@ -612,9 +612,16 @@ def trial_under(inputs: Inputs, suspect: Suspect, state: float) -> tuple[Trial[V
         *(
             pytest.param(*one, marks=pytest.mark.slow)
             for one in (
-                (World(seed=3, sizes={5: 1.3}), "corners", ("tag-size", "5"), 0.6 * np.log(1.3), np.log(1.3), 0.005),
+                (
+                    World(seed=3, seconds=40.0, sizes={5: 1.3}),
+                    "corners",
+                    ("tag-size", "5"),
+                    0.6 * np.log(1.3),
+                    np.log(1.3),
+                    0.005,
+                ),
                 # of a lens the state is set, not added to what is stated, and k2 is another than its square
-                (World(seed=8, bent=-0.2), "corners", ("distortion", "front, back"), -0.23, -0.2, 0.02),
+                (World(seed=8, seconds=40.0, bent=-0.2), "corners", ("distortion", "front, back"), -0.23, -0.2, 0.02),
             )
         ),
     ],

@@ -57,12 +57,12 @@ def with_corners(recording: SpatialRecording, corner_px: FloatArray) -> SpatialR
 
 @pytest.fixture(scope="module")
 def corners() -> SpatialRecording:
-    return World(seed=11).space()
+    return World(seed=11, seconds=40.0).space()
 
 
 @pytest.fixture(scope="module")
 def poses() -> SpatialRecording:
-    return World(seed=11).space(corners=False)
+    return World(seed=11, seconds=40.0).space(corners=False)
 
 
 CORNERS = {
@@ -203,7 +203,9 @@ def test_a_drive_as_it_is_has_no_wrong_axes(world: World) -> None:
 @pytest.mark.parametrize("how", ["lateral", "exchanged"])
 def test_a_drive_with_other_axes_is_solved_and_moves_nothing(how: str) -> None:
     written, code, word = DRIVES[how]
-    result = run_slam(Sideways(seed=4, **written).space(corners=False), prior_map=World().map_in_space().as_prior(0.01))
+    result = run_slam(
+        Sideways(seed=4, seconds=40.0, **written).space(corners=False), prior_map=World().map_in_space().as_prior(0.01)
+    )
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
     (cause,) = result.causes
