@@ -196,6 +196,8 @@ def test_looks_that_jump_are_no_move_in_view() -> None:
         assert not _moves_in_view(0.2 * jumped, radius_m, taken_s)
         slept_s = taken_s + np.where(np.arange(12) >= first, 5.0, 0.0)
         assert not _moves_in_view(jumped, radius_m, slept_s)
+    strayed = np.where(np.arange(12) < 6, 0.0, 1.0) + np.where(np.arange(12) % 3 == 0, 0.2, 0.0)
+    assert not _moves_in_view(np.column_stack([strayed, strayed]), radius_m, taken_s)  # in no place in a row
 
 
 @pytest.mark.parametrize("size", [0.85, 1.3])
