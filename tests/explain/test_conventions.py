@@ -468,6 +468,7 @@ def test_a_sensor_that_sits_where_it_is_stated_stays(world: World) -> None:
     assert np.abs(find_mount(world.plane(), USUAL)[0]) < 0.1
 
 
+@pytest.mark.slow
 def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone() -> None:
     recording = with_ranges_alone(with_sensor_at(World(seed=6, seconds=40.0).plane(), 0.2))
     driven = recording.odometry

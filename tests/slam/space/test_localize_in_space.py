@@ -271,6 +271,7 @@ def test_the_covariance_of_a_large_map_is_as_large_as_of_a_small_one() -> None:
     assert sizes[0] == sizes[1]
 
 
+@pytest.mark.slow
 def test_a_living_map_of_tags_is_localised_in_and_stays_as_it_is() -> None:
     site = Site.of(1)
     first, second = site.patrol(1, 0, 1.0, 14.0), site.patrol(1, 1, 2.0, 13.0)

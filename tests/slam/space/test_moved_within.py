@@ -70,9 +70,10 @@ def check_moves(world: World, recording: SpatialRecording, moves: tuple[Move, ..
     return result
 
 
-@pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("corners", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("move", [FAR, pytest.param(TURN, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("corners", [True, False])
+@pytest.mark.parametrize("move", [FAR, TURN])
 def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
     world = tagged_corridor(1, moves=(move,))
     result = check_moves(world, world.recording if corners else as_poses(world, 1), (move,), mapped=mapped)
