@@ -468,14 +468,15 @@ def test_a_sensor_that_sits_where_it_is_stated_stays(world: World) -> None:
     assert np.abs(find_mount(world.plane(), USUAL)[0]) < 0.1
 
 
-@pytest.mark.slow
-def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone() -> None:
-    recording = with_ranges_alone(with_sensor_at(World(seed=6, seconds=40.0).plane(), 0.2))
+@pytest.mark.parametrize("in_map", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone(in_map: bool) -> None:
+    world = World(seed=6, seconds=40.0)
+    recording, given = with_ranges_alone(with_sensor_at(world.plane(), 0.2)), world.map_in_plane() if in_map else None
     driven = recording.odometry
     wrong = replace(recording, odometry=replace(driven, forward_mps=-driven.forward_mps))
-    (cause,) = run_slam(wrong).causes
+    (cause,) = run_slam(wrong, prior_map=given).causes
     assert (cause.code, cause.subject) == ("forward-sign", "forward_mps")
-    assert run_slam(recording).causes == ()
+    assert run_slam(recording, prior_map=given).causes == ()
 
 
 WAYS = [Mistake("", "", lateral=-1.0, forward=3.6), Mistake("", "", exchanged=True, turn=-1.0)]
