@@ -105,7 +105,7 @@ print((above, below)[sys.argv[1] == "below"](1.0))
 """
 
 
-@pytest.mark.parametrize(("other", "result"), [("above", "3.0"), ("below", "2.0")])
+@pytest.mark.parametrize(("other", "result"), [("above", "3.0"), pytest.param("below", "2.0", marks=pytest.mark.slow)])
 def test_of_processes_that_need_the_same_code_one_compiles_it(tmp_path: Path, other: str, result: str) -> None:
     """Also where one needs it for a kernel that calls it."""
     (tmp_path / "at_once.py").write_text(AT_ONCE)

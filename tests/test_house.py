@@ -21,6 +21,12 @@ def tree_of(name: str) -> ast.Module:
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
+@cache
+def nodes_of(name: str) -> tuple[ast.AST, ...]:
+    """All of its tree, walked once for all rules."""
+    return tuple(ast.walk(tree_of(name)))
+
+
 SETTLED = (
     "live", "maps.sessions", "runs.persist", "sensing", "slam.association", "slam.changes", "slam.space", "tracking",
 )  # fmt: skip
@@ -53,7 +59,7 @@ BACKWARDS = {("evermap.maps.living", "evermap.maps.sessions.believe")}
 def imported(name: str) -> set[str]:
     """Modules of ours that a module imports anywhere, inside functions and for type checking too."""
     found: set[str] = set()
-    for node in ast.walk(tree_of(name)):
+    for node in nodes_of(name):
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
@@ -88,7 +94,7 @@ def classes_from(base: str) -> dict[str, ast.ClassDef]:
     return {
         node.name: node
         for name in MODULES
-        for node in ast.walk(tree_of(name))
+        for node in nodes_of(name)
         if isinstance(node, ast.ClassDef) and base in {ast.unparse(by).partition("[")[0] for by in node.bases}
     }
 
@@ -214,7 +220,7 @@ def test_one_solver_one_noise_learner_one_overlay() -> None:
         for name in callers.keys() & set(called(tree_of(module))):
             callers[name].add(module.removeprefix("evermap."))
     assert {name: more for name in callers if (more := callers[name] - ONE_OF_EACH[name])} == {}
-    homes = [node.name for name in MODULES for node in ast.walk(tree_of(name)) if isinstance(node, ast.FunctionDef)]
+    homes = [node.name for name in MODULES for node in nodes_of(name) if isinstance(node, ast.FunctionDef)]
     assert {name: homes.count(name) for name in ONE_OF_EACH} == dict.fromkeys(ONE_OF_EACH, 1)
 
 
@@ -235,7 +241,7 @@ def test_who_solves_by_itself_is_known() -> None:
     for module in MODULES:
         if not module.startswith(("evermap.slam.", "evermap.maps.", "evermap.align.", "evermap.tracking.")):
             continue
-        loops = (node for node in ast.walk(tree_of(module)) if isinstance(node, ast.For | ast.While))
+        loops = (node for node in nodes_of(module) if isinstance(node, ast.For | ast.While))
         if any(ast.unparse(one.func) == "np.linalg.solve" for loop in loops for one in ast.walk(loop)
                if isinstance(one, ast.Call)):  # fmt: skip
             own.add(module.removeprefix("evermap."))

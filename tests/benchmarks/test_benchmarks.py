@@ -55,6 +55,7 @@ def test_contenders_find_the_same_positions(run: ModuleType, worlds: dict[bool, 
     np.testing.assert_array_equal(np.isfinite(ours.landmark), np.isfinite(theirs.landmark))
 
 
+@pytest.mark.slow
 def test_both_batch_contenders_reach_the_same_uncertainty(run: ModuleType, worlds: dict[bool, Any]) -> None:
     ours, theirs = (contender(worlds[False]) for contender in run.CONTENDERS["batch"])
     scale = np.abs(theirs.pose_covariance).max()

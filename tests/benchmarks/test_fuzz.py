@@ -13,6 +13,8 @@ FEWER = 4
 """Files of kinds that take long to read, in the quick tests."""
 LONG = ("bags", "models", "maps", "old-maps")
 """Beginnings of their names."""
+NIGHTLY = ("bags-mcap", "bags-sqlite", "old-maps")
+"""Of kinds that are read alike one is quick."""
 KINDS = [
     "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",
     "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
@@ -30,7 +32,7 @@ def test_the_slice_has_every_kind(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "files"),
-    [(name, FEWER if name.startswith(LONG) else FILES) for name in KINDS]
+    [(name, FEWER if name.startswith(LONG) else FILES) for name in KINDS if name not in NIGHTLY]
     + [pytest.param(name, FILES, marks=pytest.mark.slow) for name in KINDS if name.startswith(LONG)],
 )
 def test_mutated_files_give_a_line_or_what_was_written(name: str, files: int, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.ab3dmot import CLASSES, Ab3dmot, generalised_overlap
 from benchmarks.kitti_score import Clear, Judged, clear, identities, swept, thresholds
 from benchmarks.overlap import overlap
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
@@ -49,6 +49,7 @@ size = st.floats(0.3, 4.0)
 boxes = st.tuples(number, number, number, size, size, size, st.floats(-7.0, 7.0)).map(np.array)
 
 
+@settings(max_examples=10)
 @given(boxes, boxes)
 def test_overlap_is_that_of_halfspaces(a: np.ndarray, b: np.ndarray) -> None:
     shared = volume_by_scipy(a, b)

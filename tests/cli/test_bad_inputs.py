@@ -388,6 +388,11 @@ DRAWN = ("half a mistake", "flipped turns")
 OBJECTS = "stamp_s,x_m,y_m,z_m,score,sigma_m\n" + "".join(f"{k},1,2,0,0.9,0.1\n" for k in range(5))
 
 
+def is_solved_again(case: Case) -> bool:
+    """Whether `slam` solves it to end as `check` does, which is asked of the same mistake; of two it is quick."""
+    return case.command == "slam" and case.code == 3 and case.name not in ("mm/s", "flipped turns")
+
+
 @pytest.fixture(scope="module")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Files:
     folder = write_template(tmp_path_factory.mktemp("bad") / "template")
@@ -400,7 +405,9 @@ def test_there_are_at_least_300_rows_and_none_is_twice() -> None:
 
 
 @pytest.mark.parametrize(
-    "case", CASES, ids=lambda case: f"{case.command}: {case.name}".encode("ascii", "replace").decode()
+    "case",
+    [pytest.param(one, marks=pytest.mark.slow) if is_solved_again(one) else one for one in CASES],
+    ids=lambda case: f"{case.command}: {case.name}".encode("ascii", "replace").decode(),
 )
 def test_bad_input_ends_with_one_line(case: Case, template: Files, tmp_path: Path) -> None:
     verb, *options = case.command.split()

@@ -171,7 +171,7 @@ def test_no_rhythm_is_found_where_there_is_none(looks: str) -> None:
         assert fit.count_s(stays.group, stays.first_s) is stays.first_s
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize(("kind", "is_searched"), [("none", False), ("mild", True), ("night", True)])
 def test_a_rhythm_is_searched_for_where_it_may_have_evidence(
     kind: str, seed: int, is_searched: bool, monkeypatch: pytest.MonkeyPatch

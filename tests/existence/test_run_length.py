@@ -163,7 +163,7 @@ def as_tabulated(prior: LifetimePrior, step_s: float) -> PiecewiseConstantHazard
     return PiecewiseConstantHazard(tuple(edge), (*rates, 0.0))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 4))])
 @pytest.mark.parametrize("name", MODELS)
 def test_the_filter_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
     model, looks = beginning(MODELS[name]), looks_at(stamps(seed), seed)
@@ -208,7 +208,7 @@ def test_smooth_lifetimes_are_those_of_their_tables() -> None:
     assert track.log_evidence[0] == pytest.approx(expected.log_evidence, abs=1e-10)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 3))])
 @pytest.mark.parametrize("name", MODELS)
 def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
     from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expectations
@@ -409,7 +409,7 @@ def share_of(kinds: tuple[int, int]) -> float:
     return shares[kinds[0]] * shares[kinds[1]]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 3))])
 def test_unusual_days_are_the_sum_over_all_their_kinds(seed: int) -> None:
     """From Sunday to Monday, over midnight: every pattern of changes on days of every two kinds."""
     looks = looks_at(stamps(seed), seed)

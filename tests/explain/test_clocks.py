@@ -23,7 +23,7 @@ from .worlds import World
 
 def record(late_s: float, *, is_measured: bool = True) -> Recording:
     """A robot that turns and changes its speed, and a sensor that stamps its frames late."""
-    recording = World(seed=3, late_s=late_s).plane()
+    recording = World(seed=3, seconds=40.0, late_s=late_s).plane()
     return replace(recording, odometry=replace(recording.odometry, is_measured=is_measured))
 
 

@@ -57,12 +57,12 @@ def with_corners(recording: SpatialRecording, corner_px: FloatArray) -> SpatialR
 
 @pytest.fixture(scope="module")
 def corners() -> SpatialRecording:
-    return World(seed=11).space()
+    return World(seed=11, seconds=40.0).space()
 
 
 @pytest.fixture(scope="module")
 def poses() -> SpatialRecording:
-    return World(seed=11).space(corners=False)
+    return World(seed=11, seconds=40.0).space(corners=False)
 
 
 CORNERS = {
@@ -203,7 +203,9 @@ def test_a_drive_as_it_is_has_no_wrong_axes(world: World) -> None:
 @pytest.mark.parametrize("how", ["lateral", "exchanged"])
 def test_a_drive_with_other_axes_is_solved_and_moves_nothing(how: str) -> None:
     written, code, word = DRIVES[how]
-    result = run_slam(Sideways(seed=4, **written).space(corners=False), prior_map=World().map_in_space().as_prior(0.01))
+    result = run_slam(
+        Sideways(seed=4, seconds=40.0, **written).space(corners=False), prior_map=World().map_in_space().as_prior(0.01)
+    )
     assert result.verdict is not None
     assert result.verdict.kind is VerdictKind.SENSOR_SUSPECT
     (cause,) = result.causes
@@ -466,13 +468,15 @@ def test_a_sensor_that_sits_where_it_is_stated_stays(world: World) -> None:
     assert np.abs(find_mount(world.plane(), USUAL)[0]) < 0.1
 
 
-def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone() -> None:
-    recording = with_ranges_alone(with_sensor_at(World(seed=6).plane(), 0.2))
+@pytest.mark.parametrize("in_map", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_forward_speeds_of_the_wrong_sign_are_named_by_ranges_alone(in_map: bool) -> None:
+    world = World(seed=6, seconds=40.0)
+    recording, given = with_ranges_alone(with_sensor_at(world.plane(), 0.2)), world.map_in_plane() if in_map else None
     driven = recording.odometry
     wrong = replace(recording, odometry=replace(driven, forward_mps=-driven.forward_mps))
-    (cause,) = run_slam(wrong).causes
+    (cause,) = run_slam(wrong, prior_map=given).causes
     assert (cause.code, cause.subject) == ("forward-sign", "forward_mps")
-    assert run_slam(recording).causes == ()
+    assert run_slam(recording, prior_map=given).causes == ()
 
 
 WAYS = [Mistake("", "", lateral=-1.0, forward=3.6), Mistake("", "", exchanged=True, turn=-1.0)]

@@ -248,7 +248,7 @@ def test_what_is_usual_of_odometry_is_marginalised(problem: tuple, monkeypatch: 
     assert scores.weigh_usual(asked) == 0.0
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_levels_without_what_was_imagined_are_worth_what_they_gain(seed: int) -> None:
     """As of a solution that imagines next to nothing; its levels are half as large."""
     recording, rules = World(seed=seed, seconds=60.0).plane(), SlamConfig(method="nohyp")

@@ -22,11 +22,11 @@ SILENT_S = (12.0, 18.0)
 
 
 def in_plane() -> Any:
-    return World(seed=4).plane()
+    return World(seed=4, seconds=40.0).plane()
 
 
 def in_space() -> Any:
-    return World(seed=4).space()
+    return World(seed=4, seconds=40.0).space()
 
 
 def standing(recording: Any) -> Any:
@@ -182,7 +182,7 @@ def test_frames_that_saw_nothing_are_no_jump() -> None:
 @pytest.mark.slow
 def test_an_odometry_that_seems_far_too_short_is_asked_about() -> None:
     """Alone, tags of another size than stated only bend the odometry, which is taken for noisy."""
-    result = run_slam(World(seed=4, longer=1.25).space())
+    result = run_slam(World(seconds=40.0, seed=4, longer=1.25).space())
     (cause,) = result.causes
     assert cause.code in ("tag-size", "odometry-scale")  # of the two nothing tells which it is
     assert cause.value == pytest.approx(1.25 if cause.code == "tag-size" else 0.8, rel=0.02)

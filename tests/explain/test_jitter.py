@@ -23,7 +23,7 @@ def stamp_on_arrival(recording: Any, sigma_s: float, seed: int = 1) -> Any:
 
 
 def make(kind: str, **more: Any) -> Any:
-    world = World(seed=3, **more)
+    world = World(seed=3, **{"seconds": 40.0} | more)
     return world.plane() if kind == "plane" else world.space(corners=kind == "corners")
 
 

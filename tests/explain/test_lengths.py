@@ -48,7 +48,7 @@ def test_without_a_map_lengths_are_those_of_the_ranges(wheels: float) -> None:
 
 def test_a_data_sheet_says_that_it_is_the_ranges() -> None:
     """A wheel that is known to a per cent, and ranges of which nothing is."""
-    recording = World(seed=6, longer=1.17).plane()
+    recording = World(seed=6, seconds=40.0, longer=1.17).plane()
     sensor = replace(recording.sensor, sigma_odometer_scale=0.01)
     result = run_slam(replace(recording, sensor=sensor))
     assert {cause.code for cause in result.causes} == {"range-scale"}

@@ -101,7 +101,7 @@ WRONG: dict[str, tuple[Callable[[SpatialRecording], SpatialRecording], str, floa
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_held_though_it_is_another_is_suspected(name: str) -> None:
     how, subject, value = WRONG[name]
-    world = World(seed=1)
+    world = World(seconds=40.0, seed=1)
     recording = how(world.space())
     found = scored(recording, world.map_in_space())
     own = next(one for one in found.calibrations if one.suspect.subject == subject)

@@ -46,7 +46,7 @@ def state_of(result: SlamResult, name: str) -> float:
     "kind", ["plane", *(pytest.param(name, marks=pytest.mark.slow) for name in ("corners", "poses"))]
 )
 def test_a_gyroscope_whose_zero_is_off_is_named_and_put_right(kind: str) -> None:
-    result = run_slam(record(World(seed=1, drift=0.002, bias_radps=-0.03), kind))
+    result = run_slam(record(World(seed=1, seconds=40.0, drift=0.002, bias_radps=-0.03), kind))
     (cause,) = result.causes
     assert (cause.code, cause.subject, cause.probability) == ("turn-bias", "odometry", 1.0)
     assert cause.value == pytest.approx(-0.03, abs=0.001)

@@ -41,7 +41,7 @@ SESSION: Any = object()
 
 @cache
 def recorded() -> tuple[Recording, Landmarks]:
-    recording = simulate_laser(LaserWorld(duration_s=60.0, n_landmarks=12), seed=5)
+    recording = simulate_laser(LaserWorld(duration_s=45.0, n_landmarks=12), seed=5)
     survey = recording.true_landmarks
     assert survey is not None
     return recording, Landmarks.at(survey.landmark_id, survey.position_m, sigma_m=0.02, frame="prior_map")
@@ -191,8 +191,8 @@ def test_an_association_that_is_worse_than_odometry_alone_is_lost() -> None:
 
 def test_runs_end_with_a_verdict() -> None:
     recording, survey = recorded()
-    for given in (None, survey):
-        verdict = run_slam(recording, prior_map=given).verdict
+    for in_map in (False, True):
+        verdict = solve_recorded(in_map=in_map).verdict
         assert verdict is not None
         assert verdict.kind is VerdictKind.SOUND, verdict.message
     seen = recording.detections

@@ -32,7 +32,7 @@ FOCAL = (700.0, 660.0, 640.0, 400.0)
 
 @dataclass(frozen=True)
 class World:
-    """A drive of 40 s, and the truth of what is stated of it.
+    """A drive of 20 s, and the truth of what is stated of it.
 
     Attributes:
         seed: of the noise.
@@ -48,7 +48,7 @@ class World:
     """
 
     seed: int = 0
-    seconds: float = 40.0
+    seconds: float = 20.0
     drift: float = 0.01
     wheels: float = 1.0
     turns: float = 1.0

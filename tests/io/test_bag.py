@@ -273,7 +273,7 @@ def test_mutated_bags_are_read_or_refused(tmp_path: Path) -> None:
     raws[".mcap"] = file.read_bytes()
     refused = 0
     for suffix, raw in raws.items():
-        for k in range(60):
+        for k in range(30):
             broken = np.frombuffer(raw, dtype=np.uint8).copy()
             broken[rng.integers(0, len(raw), 1 + k % 8)] = rng.integers(0, 256, 1 + k % 8)
             path = tmp_path / f"broken{k}{suffix}"
@@ -282,7 +282,7 @@ def test_mutated_bags_are_read_or_refused(tmp_path: Path) -> None:
                 read_bag(path)
             except (InputError, DataError):
                 refused += 1
-    assert refused > 20
+    assert refused > 10
 
 
 def test_types_that_nothing_defines_are_told(tmp_path: Path) -> None:

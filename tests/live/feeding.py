@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,17 @@ from evermap_studies.sim import BuildingConfig, simulate_building
 
 SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=35.0), 3).sessions
 AT_THE_END = Config(live={"revision_s": 0.0})
+
+
+@cache
+def map_of_two() -> bytes:
+    """The file of a map into which the first two sessions came, as recordings enter."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "site.evermap"
+        for recording in SESSIONS[:2]:
+            entered(path, recording)
+        return path.read_bytes()
+
 
 Message = tuple[float, str, int]
 """Stamp, 'odometry' or 'frame', and its row."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from feeding import AT_THE_END, SESSIONS, assert_equal, engine, entered, fed, messages, online, send, stored
+from feeding import AT_THE_END, SESSIONS, assert_equal, engine, entered, fed, map_of_two, messages, online, send, stored
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import evermap as em
@@ -35,8 +35,7 @@ from evermap.types import ChangeKind, Clock, Landmarks, Sensor
 def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of two sessions, as recordings enter."""
     path = tmp_path_factory.mktemp("map") / "site.evermap"
-    for recording in SESSIONS[:2]:
-        entered(path, recording)
+    path.write_bytes(map_of_two())
     return path
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from feeding import AT_THE_END, SESSIONS, engine, entered, online, stored
+from feeding import AT_THE_END, SESSIONS, engine, map_of_two, online, stored
 
 import evermap as em
 from evermap.config import Config
@@ -44,8 +44,7 @@ STRING = "std_msgs::msg::dds_::String_/RIHS01_df668c740482bbd48fb39d76a70dfd4bd5
 @pytest.fixture(scope="module")
 def living(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
     path = tmp_path_factory.mktemp("map") / "site.evermap"
-    for recording in SESSIONS[:2]:
-        entered(path, recording)
+    path.write_bytes(map_of_two())
     return stored(path)
 
 

@@ -46,7 +46,7 @@ def two_sites(living: LivingMap) -> tuple[IntArray, IntArray]:
     raise AssertionError("there is none")
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_the_covariance_is_that_of_drawn_maps(seed: int) -> None:
     """The whole map is drawn, with its metre; a shift of all of it, however uncertain, changes nothing."""
     living = map_of_two_sites(seed)
@@ -125,7 +125,8 @@ def displacement_nees(seed: int, *, patrol_s: float) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_displacements_are_as_uncertain_as_they_are_told(seed: int) -> None:
     found = displacement_nees(seed, patrol_s=100.0)
     assert len(found) >= 6

@@ -200,6 +200,7 @@ def test_of_two_that_are_not_decided_none_decides_the_other() -> None:
     assert [one.state for one in with_exchanges(both, given)] == [EntryState.UNDECIDED] * 2
 
 
+@pytest.mark.slow
 def test_what_moved_while_the_robot_drove_is_stale_from_then_on() -> None:
     """On the way back the tag 6 hangs where 14 was: its number is at two places, one after the other."""
     world = corridor(3)
@@ -335,7 +336,10 @@ def test_a_verdict_decides_whether_a_drive_counts(kind, causes, counts, monkeypa
     assert found.drives[0].sensor == ("tags are 3 % smaller than stated; tag_size_m = 0.097",) * causes
 
 
-@pytest.mark.parametrize(("factor", "fix"), [((3.2808, 3.2808), "0.3048"), ((1.0, -1.0), "the sign of y")])
+@pytest.mark.parametrize(
+    ("factor", "fix"),
+    [((3.2808, 3.2808), "0.3048"), pytest.param((1.0, -1.0), "the sign of y", marks=pytest.mark.slow)],
+)
 def test_a_map_that_is_wrong_as_a_whole_says_so_and_of_no_entry_anything(factor, fix) -> None:
     """In feet, mirrored: all its entries are off, and what mends them is one line."""
     recording = hall(1)
@@ -443,6 +447,20 @@ def test_nothing_is_claimed_that_is_not_nine_times_as_probable(probability: floa
     (entry,) = [one for one in found.entries if one.landmark_id == 3]
     assert entry.state is EntryState(state)
     assert entry.probability == pytest.approx(probability, abs=1e-3)
+
+
+def test_what_a_drive_saw_to_move_is_stale_from_then_on(monkeypatch) -> None:
+    result, world = solved_corridor(), corridor(2)
+    from_s, to_s = (float(world.recording.frames.stamp_s[frame]) for frame in (100, 110))
+    row = int(np.flatnonzero(result.landmarks.landmark_id == 3)[0])
+    change = MapChange((3,), ChangeKind.MOVED, from_s, to_s, (0.0, 0.0, 0.5), 0.0, 0.999)
+    moved = replace(result, landmarks=shifted(result.landmarks, row, [0.0, 0.0, 0.5]), changes=(change,))
+    monkeypatch.setattr(audit_module, "run_slam", lambda *_, **__: moved)
+    found = audit_map(surveyed(world).as_prior(0.01), [world.recording])
+    assert told(found) == {"3": EntryState.STALE}
+    (entry,) = found.faults
+    assert (entry.from_s, entry.to_s) == (from_s, to_s)
+    assert entry.position_m == pytest.approx(world.tags.position_m[3] + [0.0, 0.0, 0.5], abs=0.1)
 
 
 @pytest.mark.parametrize(("metres", "degrees", "what"), [(0.1, 0.0, "position"), (0.0, 5.0, "rotation")])

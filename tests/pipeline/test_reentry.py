@@ -78,22 +78,22 @@ def otherwise(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
 
 def test_other_settings_give_the_map_that_they_give_from_the_beginning(tmp_path: Path) -> None:
     path, work = tmp_path / "site.evermap", tmp_path / "again.evermap"
-    before, otherwise = stored(begun(path, 0, 2, 1)), built(tmp_path / "otherwise.evermap", (0, 1, 2), OTHER)
+    before, otherwise = stored(begun(path, 1, 0)), built(tmp_path / "otherwise.evermap", (0, 1), OTHER)
     data = path.read_bytes()
     found = reenter(str(path), work, OTHER)
-    assert (found.sessions, found.kept, found.parent, found.revision, found.adopted) == (3, 0, 3, 7, False)
+    assert (found.sessions, found.kept, found.parent, found.revision, found.adopted) == (2, 0, 2, 5, False)
     assert path.read_bytes() == data
     with open_store(work) as store:
         assert_same(store.load(), otherwise)
-        assert [item.provenance.recording for item in store.log()[4:]] == [one.name for one in SESSIONS[:3]]
+        assert [item.provenance.recording for item in store.log()[3:]] == [one.name for one in SESSIONS[:2]]
     found = reenter(str(path), work, OTHER, adopt=True)
-    assert (found.kept, found.adopted) == (3, True)  # nothing is entered again
+    assert (found.kept, found.adopted) == (2, True)  # nothing is entered again
     with open_store(path) as store:
         assert_same(store.load(), otherwise)
-        assert store.lineage() == (4, 5, 6, 7)
+        assert store.lineage() == (3, 4, 5)
         assert len(store.evidence()) > 0
-        assert sorted(item.name for item in store.attachments()) == ["recording"] * 3 + ["trajectory"] * 3
-        store.revert(3)
+        assert sorted(item.name for item in store.attachments()) == ["recording"] * 2 + ["trajectory"] * 2
+        store.revert(2)
         assert_same(store.load(), before)
     assert verify_store(path).sound
 

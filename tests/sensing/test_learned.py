@@ -154,7 +154,7 @@ def run_frames(model, looks, *, landmark_of=None, active=None, probability=None)
     return model, every
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_a_world_that_is_moved_as_a_whole_is_the_same_world(seed):
     """By quarter turns: directions change their faces, and nothing else changes."""
     rng = np.random.default_rng(seed)

@@ -41,8 +41,9 @@ def zips(folders: list[Path]) -> list[bytes]:
     ]
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
 def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Where a server keeps its maps; what the databases do differently asks for `BOTH_DATABASES`."""
     if request.param == "sqlite":
         return str(tmp_path / "maps")
     address: str = request.getfixturevalue("postgres")

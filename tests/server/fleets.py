@@ -99,3 +99,4 @@ def wait_until(holds: Callable[[], bool]) -> None:
 
 
 SQLITE_ONLY = pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+BOTH_DATABASES = pytest.mark.parametrize("where", ["sqlite", "postgresql"], indirect=True)

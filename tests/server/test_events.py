@@ -11,9 +11,10 @@ pytest.importorskip("fastapi", reason="a server needs evermap[server]")
 pytest.importorskip("httpx", reason="needs httpx: pip install 'evermap[dev]'")
 
 import httpx
-from fleets import SQLITE_ONLY, Fleet, held, served, wait_until
+from fleets import BOTH_DATABASES, SQLITE_ONLY, Fleet, held, served, wait_until
 
 
+@BOTH_DATABASES
 def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """In PostgreSQL because they are announced, from other processes and after an outage too, else by asking."""
     announced = "postgresql" in fleet.where

@@ -627,7 +627,9 @@ def test_lifetimes_are_told_by_class_and_by_place(site: Site, browser: Browser) 
     assert drawn == ["10", "10", "10", "10"]  # y of the picture falls
 
 
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize(
+    "look", [pytest.param(one, marks=pytest.mark.slow) if one == "phone-dark" else one for one in LOOKS]
+)
 def test_everybody_can_read_it(site: Site, browser: Browser, look: str) -> None:
     axe = Path(os.environ.get("AXE", AXE))
     browser.show(*LOOKS[look])

@@ -10,7 +10,8 @@ pytest.importorskip("schemathesis", reason="needs schemathesis: pip install 'eve
 from benchmarks.http_fuzz import fuzz, served
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [100])
 def test_random_requests_are_answered_or_refused(count: int) -> None:
     with served(sessions=1) as (app, tokens):
         found = fuzz(app, tokens, count, 7, each=2)

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("fastapi", reason="a server needs evermap[server]")
 pytest.importorskip("httpx", reason="needs httpx: pip install 'evermap[dev]'")
 
-from fleets import SQLITE_ONLY, Fleet, assert_same, held
+from fleets import BOTH_DATABASES, SQLITE_ONLY, Fleet, assert_same, held
 from sqlalchemy import text
 from typer.testing import CliRunner
 
@@ -82,6 +82,7 @@ def test_tokens_are_kept_as_digests_and_can_be_revoked(fleet: Fleet) -> None:
         assert not any(token.encode() in kept for token in fleet.tokens.values())
 
 
+@BOTH_DATABASES
 def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[bytes], tmp_path: Path) -> None:
     answer = fleet.upload(zips[0])
     assert answer.status_code == 202
@@ -401,6 +402,7 @@ def test_links_have_the_address_that_robots_know(fleet: Fleet, zips: list[bytes]
         assert link() == "https://maps.example.com/fleet/maps/ward/file?revision=1"
 
 
+@BOTH_DATABASES
 def test_pruning_keeps_the_approved_revision(fleet: Fleet, zips: list[bytes]) -> None:
     fleet.upload(zips[0])
     fleet.worker().step()

@@ -35,7 +35,7 @@ def with_poses_at(world: World, stamps: np.ndarray, pose: np.ndarray) -> tuple[W
     return World(problem, world.noise, start), start, row_of[len(world.problem.stamp_s) :]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_bridged_poses_are_the_dense_posterior(seed):
     world = make_world(seed, n_poses=12, prior=PLAIN, step_s=3.0, noise=CALM)
     estimate, marginals = smoothed(world, world.truth)
@@ -117,7 +117,7 @@ def test_dead_reckoning_composes_the_increments():
         assert np.abs((covariance[k] - once) / np.outer(sigma, sigma)).max() < 0.02
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_at_the_instants_of_poses_these_are_the_poses(seed):
     """And others are what they are without those among them."""
     world = make_world(seed, n_poses=12, prior=PLAIN, step_s=3.0, noise=CALM)

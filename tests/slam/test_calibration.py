@@ -433,7 +433,7 @@ def stopping(late_s: float, seed: int) -> Recording:
     return Recording("stops", odometry, Frames(0.02 * frame + late_s), detections, Sensor(0.1, 8.0, -0.65, 0.65))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_stops_show_a_delay_though_the_odometry_is_slow(seed: int):
     delay = told(stopping(0.2, seed))["odometry_delay_s"]
     assert delay.p_needed > 0.99

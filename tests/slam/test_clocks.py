@@ -26,7 +26,7 @@ def two_cameras(seed: int, late_s: float, *, in_map: bool = False) -> tuple[Spat
     return recording, drive.places
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 @pytest.mark.parametrize("late_s", [0.0, 0.08, -0.15, 0.4])
 def test_sensors_of_several_clocks_are_estimated_in_space(seed: int, late_s: float) -> None:
     """In the plane all detections are one sensor's."""

@@ -48,7 +48,7 @@ def is_moving(recording: Recording, drive: YardDrive) -> BoolArray:
     return np.asarray((body >= 0) & drive.moves[np.maximum(body, 0), step])
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_what_moves_is_left_out_and_nothing_else_much(seed: int) -> None:
     drive = yard(seed)
     recording = flat(drive)

@@ -55,7 +55,7 @@ def test_mounts_that_see_heights_stand_are_of_the_plane(off: dict[str, float]) -
     assert not is_in_space(in_its_space(driven(4, **off), CONFIG.slam))
 
 
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("pitch", [-0.17, 0.08])
 def test_mounts_that_are_pitched_are_asked_in_space(seed: int, pitch: float) -> None:
     assert is_in_space(in_its_space(driven(seed, pitch=pitch), CONFIG.slam))

@@ -122,6 +122,7 @@ def test_every_setting_has_its_own_stream_and_the_seed_decides() -> None:
     assert looks[0] != looks[1], "figures 3 a to c and 3 d must not share their sequences"
 
 
+@pytest.mark.slow
 @needs_golden
 def test_some_reference_numbers_are_met() -> None:
     settings = rosen2016.Settings(detector_errors=(0.1, 0.4), revisit_rates_hz=(1 / 50, 1 / 5), sequences=2000)

@@ -110,7 +110,7 @@ def majority(ids: list[list[int]]) -> IntArray:
     return np.array([np.bincount(mine).argmax() for mine in ids])
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
 def test_who_leaves_view_and_comes_back_static_keeps_its_identity(seed: int) -> None:
     """Five hundred objects swing about their places, come to rest there, and are not in view for an hour."""
     rng = np.random.default_rng(seed)
@@ -141,7 +141,7 @@ def test_who_leaves_view_and_comes_back_static_keeps_its_identity(seed: int) -> 
     assert np.mean(majority(ids["before"]) == majority(ids["after"])) >= 0.99
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("with_appearance", [True, False])
 def test_exchanged_objects_are_told_apart_by_what_they_look_like(seed: int, with_appearance: bool) -> None:
     """In a ring of a hundred everyone moves on by one place; cosines of two views of the same are about 0.9."""

@@ -53,7 +53,7 @@ def test_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
     assert found.drift_m == best_drift_m
 
 
-@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 12))])
+@pytest.mark.parametrize("seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 12))])
 def test_in_space_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
     """Where it lies about is known there, and orientations say something of each site."""
     random = np.random.default_rng(300 + seed)
@@ -85,7 +85,7 @@ def test_in_space_the_most_probable_of_all_assignments_is_found(seed: int) -> No
         np.testing.assert_allclose(found.probability[one.sighted.clique == clique], want, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
 def test_probability_is_that_of_a_clique_given_the_others(seed: int) -> None:
     random = np.random.default_rng(100 + seed)
     one = world(random, [1, 2, 1, 1, 2], [1, 1, 2, 1, 1], [0, 0, 1, 0, ELSEWHERE], sigma_m=0.08)
@@ -119,7 +119,7 @@ def test_what_agrees_with_what_stands_is_added_together(monkeypatch: pytest.Monk
     assert len(asked) <= 8
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(
     st.integers(0, 2**32 - 1), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0), st.floats(-np.pi, np.pi)
 )  # fmt: skip
@@ -338,7 +338,7 @@ def test_a_single_body_must_be_likelier_to_have_stayed_than_what_it_denies(
     assert (found is not None) == is_found
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
 def test_bodies_that_moved_together_by_less_than_agreement_do_not_bend_what_stands(seed: int) -> None:
     """The motion that most are near lies between both; either reading is found from there, the likelier is taken."""
     site = [0] * 5 + [ELSEWHERE] * 2

@@ -192,7 +192,7 @@ def test_the_same_recordings_make_the_same_map_bit_by_bit(
     changing: dict[int, tuple[BuildingSimulation, list[Session]]],
 ) -> None:
     world, sessions = changing[2]
-    for one, again in zip(sessions, lived_through(world.sessions), strict=True):
+    for one, again in zip(sessions[:2], lived_through(world.sessions[:2]), strict=True):
         assert_same_bytes(one.living, again.living)
         assert_same_bytes(one.changes, again.changes)
         assert_same_bytes(one.evidence, again.evidence)
@@ -368,7 +368,7 @@ def test_a_session_is_as_old_as_its_recording_whatever_is_left_out(
         assert after.living.session_start_s == expected_s
 
 
-@pytest.mark.parametrize("seed", [5, 6, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (7, 8))])
+@pytest.mark.parametrize("seed", [5, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (6, 7, 8))])
 def test_another_building_with_the_same_identities_is_not_this_one(
     seed: int, still: tuple[BuildingSimulation, list[Session]]
 ) -> None:

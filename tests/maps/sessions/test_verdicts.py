@@ -145,8 +145,20 @@ def make_refused_drive(day: int = 1) -> AnyRecording:
     return drive(day, wrong.readings(1.05), LASER, wrong.vanishes(2))
 
 
-def test_what_does_not_enter_the_map_reports_no_change(lit: LivingMap) -> None:
-    right = run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
+@pytest.fixture(scope="module")
+def since(lit: LivingMap) -> Session:
+    """A drive after two poles were taken away."""
+    return run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
+
+
+@pytest.fixture(scope="module")
+def believed(lit: LivingMap) -> Session:
+    """The drive that is refused, in a map that takes any."""
+    return run_session(make_refused_drive(), lit, ANY)
+
+
+def test_what_does_not_enter_the_map_reports_no_change(lit: LivingMap, since: Session, believed: Session) -> None:
+    right = since
     assert [change.kind for change in right.changes] == [ChangeKind.VANISHED] * 2
     assert not right.refusal(Config().living)
     session = run_session(make_refused_drive(), lit)
@@ -156,25 +168,22 @@ def test_what_does_not_enter_the_map_reports_no_change(lit: LivingMap) -> None:
     assert "0.95" in session.slam.verdict.message or "range_slope = 0.05" in session.slam.verdict.message
     assert (session.changes, session.slam.changes, session.slam.alternatives) == ((), (), ())
     assert not len(session.slam.gone)
-    believed = run_session(make_refused_drive(), lit, ANY)
     assert not believed.refusal(ANY.living)
     assert believed.changes == believed.slam.changes
     assert [change.landmark_ids for change in believed.changes] == [change.landmark_ids for change in right.changes]
     assert set(believed.slam.gone.landmark_id) == {change.landmark_ids[0] for change in right.changes}
 
 
-def test_what_a_map_has_not_believed_before_stays_gone(lit: LivingMap) -> None:
+def test_what_a_map_has_not_believed_before_stays_gone(since: Session) -> None:
     """A session that is refused takes back what it says itself, not what others have said."""
-    since = run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
     refused = run_session(make_refused_drive(2), since.living)
     assert set(refused.slam.gone.landmark_id) == set(since.slam.gone.landmark_id) != set()
     assert not refused.changes
 
 
-def test_what_is_set_aside_by_its_own_solution_reports_no_change(lit: LivingMap) -> None:
+def test_what_is_set_aside_by_its_own_solution_reports_no_change(lit: LivingMap, believed: Session) -> None:
     """Its result, which is its own, may have found some in the map that was given for that."""
-    entered = run_session(make_refused_drive(), lit, ANY)
-    lost = replace(entered, found=False, set_aside=("too few", "another map"))
+    lost = replace(believed, found=False, set_aside=("too few", "another map"))
     kept = without_doubted(lost, lit, ANY.living)
     assert (kept.changes, kept.slam.changes, len(kept.slam.gone)) == ((), (), 0)
     assert kept.refusal(ANY.living) == "too few"

@@ -163,7 +163,7 @@ def radii(rng: np.random.Generator, row: np.ndarray) -> Traits:
     return Traits(value[:, None], Variances(np.full(1, 1e-4), np.full(1, 1e-4), np.full(1, 0.02), 1.0))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 3))])
 def test_misread_radii_split_nothing(seed: int) -> None:
     made = make_world(seed, n_poses=60, n_landmarks=8, prior=CalibrationPrior.from_settings(calibrated=False))
     true = made.problem.landmark_row

@@ -70,7 +70,7 @@ def dense_evidence(problem: Problem, world: World, position: np.ndarray) -> tupl
 
 
 @pytest.mark.parametrize("bounds", [[0, 24], [0, 8, 16, 24], [0, 1, 12, 24]])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_evidence_is_the_schur_complement(bounds: list[int], seed: int) -> None:
     """With noise and outliers, at a place that is not the optimum: information and pull, copies and all."""
     world = make_world(seed, n_poses=24, n_landmarks=5, prior=KNOWN_SIZE, p_outlier=0.1, turn_radps=0.2)

@@ -290,7 +290,7 @@ def test_points_are_found_in_a_large_survey():
     assert all(name == real for name, real in named_as(drive, session.recording).items())
 
 
-@pytest.mark.parametrize("share", [0.05, pytest.param(0.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("share", [pytest.param(share, marks=pytest.mark.slow) for share in (0.05, 0.5)])
 def test_points_of_which_some_have_names_keep_them_over_sessions(share):
     whole, gone = hall(1, n_points=60, n_frames=400, step_s=0.6, drift=0.05), [3, 20, 41]
     named = np.random.default_rng(0).permutation(60)[: int(60 * share)]

@@ -116,6 +116,7 @@ def standing_yard() -> tuple[YardDrive, em.Session]:
     return drive, em.run_session(drive.recording)
 
 
+@pytest.mark.slow
 def test_a_yard_that_stands_is_mapped_as_if_nothing_was_stated(standing_yard: tuple[YardDrive, em.Session]) -> None:
     drive, stated = standing_yard[0], standing_yard[1].slam
     unstated = em.run_slam(

@@ -73,7 +73,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.4])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 3))])
 @pytest.mark.parametrize(("kind", "oriented", "alike"), KINDS)
 def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, seed, delay):
     ray = alike == "ray"
@@ -105,7 +105,7 @@ def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, 
     assert block[:, :-1] == pytest.approx(np.column_stack(columns), abs=2e-4 * max(1.0, np.abs(block).max()))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 4))])
 @pytest.mark.parametrize(
     ("generators", "group"),
     [

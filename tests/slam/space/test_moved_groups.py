@@ -106,7 +106,9 @@ def test_two_tags_that_were_exchanged_are_each_where_the_other_was():
     np.testing.assert_allclose(told[2,], -told[9,], atol=0.05)
 
 
-@pytest.mark.parametrize("seed", [300, 301, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(302, 310))])
+@pytest.mark.parametrize(
+    "seed", [301, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (300, *range(302, 310)))]
+)
 def test_nothing_is_told_where_nothing_moved(seed):
     random = np.random.default_rng(seed)
     world = tagged_corridor(seed, drift=0.04 if seed % 3 else 0.01, p_wrong=0.03 * (seed % 2), odometry=seed % 4 > 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,7 @@ from evermap.slam.space.against_map import MapComparison
 from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, has_moved
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.marginal import _cost_of_outliers
-from evermap.slam.space.problem import SpatialNoise
+from evermap.slam.space.problem import SpatialNoise, SpatialProblem
 from evermap.slam.space.solve import solve_space
 from evermap.types import ANY_RANGE_M2, ChangeKind, Frames, SlamResult, SpatialRecording
 
@@ -69,9 +70,10 @@ def check_moves(world: World, recording: SpatialRecording, moves: tuple[Move, ..
     return result
 
 
-@pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("corners", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("move", [FAR, pytest.param(TURN, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("corners", [True, False])
+@pytest.mark.parametrize("move", [FAR, TURN])
 def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
     world = tagged_corridor(1, moves=(move,))
     result = check_moves(world, world.recording if corners else as_poses(world, 1), (move,), mapped=mapped)
@@ -80,7 +82,8 @@ def test_a_tag_that_is_moved_is_one_tag_that_moved(move, corners, mapped):
         assert at == pytest.approx(world.tags.position_m[[move.tag]] + move.by_m, abs=0.05)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2])
 def test_a_move_by_less_than_another_landmark_would_be_away_is_found_by_corners(seed):
     world = tagged_corridor(seed, moves=(NEAR,))
     check_moves(world, world.recording, (NEAR,), mapped=False)
@@ -117,8 +120,10 @@ def as_directions(world: World, seed: int, sigma_rad: float = 0.001) -> SpatialR
     ("move", "mapped"),
     [
         (Move(3, 8.0, (0.6, 0.0, 0.3)), True),
-        (Move(5, 20.0, (0.0, 0.5, 0.0)), True),
-        (Move(3, 8.0, (0.6, 0.0, 0.3)), False),
+        *(
+            pytest.param(*one, marks=pytest.mark.slow)
+            for one in ((Move(5, 20.0, (0.0, 0.5, 0.0)), True), (Move(3, 8.0, (0.6, 0.0, 0.3)), False))
+        ),
     ],
 )
 def test_a_landmark_of_which_only_directions_are_seen_is_moved(move, mapped):
@@ -195,7 +200,7 @@ def test_two_tags_with_one_identity_are_two_where_no_look_shows_that_one_left(se
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("late_s", [0.0, 0.2])
+@pytest.mark.parametrize("late_s", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
 def test_nothing_moved_where_the_camera_is_late_or_identities_are_wrong(seed, late_s):
     world = tagged_corridor(seed, p_wrong=0.03)
     frames = Frames(world.recording.frames.stamp_s + late_s)
@@ -247,6 +252,13 @@ def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
     assert left_out == [[4, 1, 0, 2], [8], [8, 7]]
 
 
+@cache
+def solved_poses() -> SpatialProblem:
+    """What is solved of a drive on which nothing moved."""
+    recording = as_poses(tagged_corridor(3), 3)
+    return solve_space(prepare_space(recording, Config().slam.space), None).optimum.smoother.problem
+
+
 @pytest.mark.parametrize(
     ("every_s", "places", "persist_s", "share", "count"),
     [
@@ -260,8 +272,7 @@ def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
 )
 def test_outliers_in_a_row_of_one_place_have_one_reason(every_s, places, persist_s, share, count):
     """How many independent outliers eight count as that alternate between places. Else one long bad view is a move."""
-    world = tagged_corridor(3)
-    problem = solve_space(prepare_space(as_poses(world, 3), Config().slam.space), None).optimum.smoother.problem
+    problem = solved_poses()
     rows = np.arange(8)
     row = replace(
         problem, stamp_s=every_s * np.arange(len(problem.stamp_s)), pose_row=np.arange(len(problem.pose_row)),

@@ -91,7 +91,7 @@ def test_the_scene_shows_what_moves_frame_by_frame(usual: tuple[Street, SlamResu
     np.testing.assert_allclose(np.median(np.concatenate(half), axis=0), 0.5 * np.array(SIZE_M), rtol=0.05)
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_bend_of_the_odometry_is_taken_off(seed: int) -> None:
     made = street(seed, bend=BEND)
     result = run_slam(made.recording)
@@ -118,10 +118,10 @@ def test_the_metre_is_that_of_the_odometry_unless_the_ranges_are_known() -> None
     assert abs(parameters["odometry_scale"].value * 1.05 - 1.0) < 0.005
 
 
-def test_good_odometry_stays_as_it_is() -> None:
-    for seed in (5, 6):
-        made = street(seed, range_scale=0.97)
-        assert errors(made, run_slam(made.recording))[1] < 0.05
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow)])
+def test_good_odometry_stays_as_it_is(seed: int) -> None:
+    made = street(seed, range_scale=0.97)
+    assert errors(made, run_slam(made.recording))[1] < 0.05
 
 
 def test_where_all_move_the_odometry_is_all_there_is() -> None:

@@ -41,7 +41,7 @@ def moved(tags: Landmarks, shift: dict[int, tuple[float, float, float]]) -> Land
     return replace(tags.as_prior(0.01), position_m=position)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_drive_with_odometry_is_mapped_from_scratch(seed):
     world = tagged_corridor(seed, drift=0.03)
     result = run_slam(world.recording)
@@ -294,7 +294,7 @@ def test_places_and_poses_are_as_sure_as_they_say():
     assert 1.0 < np.mean(of_poses) < 3.6
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_points_of_which_only_the_direction_is_seen_are_triangulated_along_the_odometry(seed):
     world = tagged_corridor(seed, n_frames=320)
     recording = as_directions(world, seed)
@@ -308,7 +308,7 @@ def test_points_of_which_only_the_direction_is_seen_are_triangulated_along_the_o
     assert 0.8 < np.nanmean(result.innovations.nis / result.innovations.dof) < 1.2
 
 
-@pytest.mark.parametrize("drift", [0.003, 0.02])
+@pytest.mark.parametrize("drift", [pytest.param(0.003, marks=pytest.mark.slow), 0.02])
 def test_directions_shrink_no_world(drift):
     """Rounds in a hall: nothing but the odometry tells the size, and the path is better than by that alone."""
     recording = hall(1, n_points=40, n_frames=400, drift=drift)

@@ -28,9 +28,8 @@ def scored(recording: SpatialRecording, result: SlamResult) -> Evaluation:
 @pytest.mark.parametrize(
     ("seed", "how"),
     [
-        (0, "odometry"),
         (3, "map by hand"),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, "by hand"), (2, "map"))),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((0, "odometry"), (1, "by hand"), (2, "map"))),
     ],
 )
 def test_it_is_as_if_an_oracle_had_undone_the_turns(seed: int, how: str) -> None:

@@ -239,6 +239,7 @@ def true_up(recording: SpatialRecording, result: SlamResult) -> np.ndarray:
     return se3.rotation_of(pose).T @ [0.0, 0.0, 1.0]
 
 
+@pytest.mark.slow
 def test_a_rig_says_where_up_is_in_its_map() -> None:
     """From detections to the map, which is in the frame of the first pose."""
     recording = on_robot(Rig(0, seconds=30.0, turns=2, gaps=1).walk(), AHEAD)

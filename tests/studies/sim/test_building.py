@@ -28,7 +28,7 @@ def crosses(a, b, c, d) -> bool:
     return side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 5))])
 def test_everything_stands_inside_and_clear_of_the_route(seed):
     simulation = simulate_building(SHORT, seed)
     plan = simulation.plan
@@ -67,7 +67,7 @@ def test_landmark_ids_are_unique_and_belong_to_one_object_each():
         assert fewest <= len(item.landmark_ids) <= most
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_events_replayed_give_the_landmarks_of_every_session(seed):
     """Day 0 and the events alone, replayed by an independent rule, tell what every session's truth says."""
     config = replace(SHORT, days=12, change_rate=2.0)

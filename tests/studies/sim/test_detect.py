@@ -103,7 +103,7 @@ def test_hits_come_with_the_stated_probability_and_only_in_view():
         assert abs(hit[band].sum() - p.sum()) < 4 * math.sqrt(np.sum(p * (1 - p)))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 3))])
 def test_every_landmark_is_seen_on_a_full_lap(seed):
     simulation = simulate_building(replace(BuildingConfig(), patrol_s=170.0), seed)
     for recording in simulation.sessions:

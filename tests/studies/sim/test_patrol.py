@@ -86,7 +86,7 @@ def test_odometry_errors_are_the_configured_ones():
         assert not odometry.lateral_mps.any()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_the_robot_visits_every_room_and_no_wall(seed):
     simulation = simulate_building(ONE_LAP, seed)
     walls = simulation.plan.walls_m

@@ -46,7 +46,7 @@ def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize("seed", TRIED)
-@pytest.mark.parametrize("method", ["em", "viterbi"])
+@pytest.mark.parametrize("method", ["em", pytest.param("viterbi", marks=pytest.mark.slow)])
 def test_a_landmark_that_moved_far_is_found_as_if_told(method: str, seed: int):
     moving = make_moving_world(seed)
     found = explain(moving, method)
@@ -59,7 +59,9 @@ def test_a_landmark_that_moved_far_is_found_as_if_told(method: str, seed: int):
 
 
 @pytest.mark.parametrize("seed", TRIED)
-@pytest.mark.parametrize("method", ["max-mixture", "nn", pytest.param("mcts", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["nn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("max-mixture", "mcts"))]
+)
 def test_selectors_that_err_at_single_looks_find_both_places_too(method: str, seed: int):
     moving = make_moving_world(seed)
     found = explain(moving, method)

@@ -35,7 +35,7 @@ def stream(moving: MovingWorld, method: object, *, told: bool = False) -> Outcom
 
 
 @pytest.mark.parametrize("method", ["em", "viterbi"])
-@pytest.mark.parametrize("seed", [5, 6, 9])
+@pytest.mark.parametrize("seed", [5, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (6, 9))])
 def test_a_stream_finds_what_moved_as_if_told(method: str, seed: int):
     moving = make_moving_world(seed)
     found = stream(moving, MultiHypothesis(6, model_of(method)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from brute_force import CHAINS, every_sequence, log_sum, looks, of_landmark, random_looks
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import InputError, NumericalError
@@ -41,6 +41,7 @@ def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, n
     np.testing.assert_allclose(found, joint, atol=1e-9)
 
 
+@settings(max_examples=10)
 @given(looks(), chains)
 def test_posteriors_and_evidence_are_sums_over_all_sequences(looks, name):
     chain = CHAINS[name]
