@@ -176,10 +176,13 @@ def type_in_once(
         return done
 
 
-def type_page(page: Path, folder: Path, typed_in: dict[str, str], together: Path, nightly: bool) -> None:
-    """Run what a page tells to type, and compare what it says is printed."""
+def type_page(page: Path, folder: Path, warm: dict[str, str], together: Path, nightly: bool = False) -> None:
+    """Run what a page tells to type, and compare what it says is printed.
+
+    The README's first commands start as a newcomer's do, all others in a process that is ready.
+    """
     recordings = {path.name: path for path in (REPOSITORY.parent / "shared" / "data").rglob("*") if path.is_file()}
-    typed, printed = "", None
+    typed, printed, fresh = "", None, page.name == "README.md"
     for block in blocks(page):
         where = f"{page.relative_to(REPOSITORY)}:{block.line}"
         if block.printed:
@@ -194,22 +197,19 @@ def type_page(page: Path, folder: Path, typed_in: dict[str, str], together: Path
         printed = list[str]()
         for command in block.commands():
             typed = after(typed, block.needs, command)
-            if typed in SHARED and page.name != "README.md":
-                done = type_in_once(command, folder, typed_in, together / typed)
+            if typed in SHARED and not fresh:
+                done = type_in_once(command, folder, warm, together / typed)
             else:
-                done = type_in(command, folder, typed_in)
+                done = type_in(command, folder, environment() if fresh else warm)
             assert done.returncode == 0, f"{where}: exit {done.returncode}\n{command[-1]}\n{done.stdout}\n{done.stderr}"
             printed += done.stdout.splitlines()
+        fresh = False
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", longest_first(PAGES), ids=lambda page: str(page.relative_to(REPOSITORY)))
-def test_what_a_page_tells_to_type_works(
-    page: Path, tmp_path: Path, together: Path, request: pytest.FixtureRequest
-) -> None:
-    """The README's commands start as a newcomer's do, those of other pages in a process that is ready."""
-    typed_in = environment() if page.name == "README.md" else request.getfixturevalue("warm")
-    type_page(page, tmp_path, typed_in, together, nightly=False)
+def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path, together: Path, warm: dict[str, str]) -> None:
+    type_page(page, tmp_path, warm, together)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 Of the seconds of most commands of the pages, the greater part goes into imports and into loading machine code, a
 hundred times the same. So one process does that, and each command is a fork of it, with the folder, the environment
 and the streams of its caller, and ends as the installed command does. It is `evermap.__main__.run` in both; that this
-starts in a fresh process is what the README's commands show, which are run without this.
+starts in a fresh process is what the README's first commands show, and the notebooks, which are run without this.
 """
 
 from __future__ import annotations
