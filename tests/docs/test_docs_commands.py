@@ -184,7 +184,7 @@ def type_page(page: Path, folder: Path, warm: dict[str, str], together: Path, ni
     recordings = {path.name: path for path in (REPOSITORY.parent / "shared" / "data").rglob("*") if path.is_file()}
     typed, printed, fresh = "", None, page.name == "README.md"
     for block in blocks(page):
-        where = f"{page.relative_to(REPOSITORY)}:{block.line}"
+        where = f"{os.path.relpath(page, REPOSITORY)}:{block.line}"
         if block.printed:
             for line in block.text.splitlines() if printed is not None else ():
                 assert any(is_printed(line, other) for other in printed), f"{where}: not printed: {line}"
@@ -223,6 +223,61 @@ def test_what_a_page_tells_to_type_works_with_what_takes_long(
     page: Path, tmp_path: Path, together: Path, warm: dict[str, str]
 ) -> None:
     type_page(page, tmp_path, warm, together, nightly=True)
+
+
+PAGE = """
+```console
+$ echo always | tee always
+$ printf "%s\\n" in \\
+    two-lines
+```
+<!-- printed: by that -->
+```text
+always
+two-...
+```
+<!-- nightly: takes 40 s -->
+```console
+$ echo nightly > nightly
+```
+<!-- printed: by that, nightly -->
+```text
+nothing
+```
+<!-- not run: never -->
+```console
+$ touch never
+```
+<!-- nightly: takes 40 s; needs: no-such-recording.zip -->
+```console
+$ touch no-such-recording
+```
+```python
+from pathlib import Path
+
+Path("python").touch()
+```
+"""
+
+
+def test_what_a_page_marks_as_nightly_runs_then(tmp_path: Path) -> None:
+    """And is compared with what it is to have printed; without it, nothing is to be printed."""
+    page, folder = tmp_path / "page.md", tmp_path / "folder"
+    page.write_text(PAGE, encoding="utf-8")
+    folder.mkdir()
+    type_page(page, folder, environment(), tmp_path)
+    assert sorted(path.name for path in folder.iterdir()) == ["always", "python"]
+    with pytest.raises(AssertionError, match="not printed: nothing"):
+        type_page(page, folder, environment(), tmp_path, nightly=True)
+    page.write_text(PAGE.replace("> nightly", "| tee nightly").replace("nothing", "nightly"), encoding="utf-8")
+    type_page(page, folder, environment(), tmp_path, nightly=True)
+    assert sorted(path.name for path in folder.iterdir()) == ["always", "nightly", "python"]
+    page.write_text(PAGE.replace("two-...", "three"), encoding="utf-8")
+    with pytest.raises(AssertionError, match="not printed: three"):
+        type_page(page, folder, environment(), tmp_path)
+    page.write_text(PAGE.replace("tee always", "tee always; false"), encoding="utf-8")
+    with pytest.raises(AssertionError, match=r"page.md:2: exit 1\necho always"):
+        type_page(page, folder, environment(), tmp_path)
 
 
 def test_commands_that_several_pages_begin_with_are_typed_once(tmp_path: Path) -> None:
