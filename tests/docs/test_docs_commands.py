@@ -404,10 +404,22 @@ def test_a_command_that_is_ready_ends_as_the_installed_one(line: str, tmp_path: 
 
 
 @pytest.mark.slow
-def test_an_error_of_a_program_is_its_end(tmp_path: Path, warm: dict[str, str]) -> None:
-    done = type_in(["python", "-c", "def f():\n    raise KeyError('missing')\nf()"], tmp_path, warm)
-    assert done.returncode == 1
-    assert done.stderr.endswith("KeyError: 'missing'\n")
+@pytest.mark.parametrize(
+    ("text", "code", "out", "err"),
+    [
+        ("def f():\n    raise KeyError('missing')\nprint('said')\nf()", 1, "said\n", "KeyError: 'missing'\n"),
+        ("import atexit\natexit.register(print, __name__)\nraise SystemExit('why')", 1, "__main__\n", "why\n"),
+        ("print('said')\nraise SystemExit(3)", 3, "said\n", ""),
+        ("raise SystemExit", 0, "", ""),
+    ],
+)
+def test_a_program_that_is_ready_ends_as_one_that_starts(
+    text: str, code: int, out: str, err: str, tmp_path: Path, warm: dict[str, str]
+) -> None:
+    done = type_in(["python", "-c", text], tmp_path, warm)
+    assert (done.returncode, done.stdout) == (code, out)
+    assert done.stderr.endswith(err)
+    assert bool(done.stderr) == bool(err)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
