@@ -276,7 +276,7 @@ def test_what_a_page_marks_as_nightly_runs_then(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="not printed: three"):
         type_page(page, folder, environment(), tmp_path)
     page.write_text(PAGE.replace("tee always", "tee always; false"), encoding="utf-8")
-    with pytest.raises(AssertionError, match="page.md:2: exit 1"):
+    with pytest.raises(AssertionError, match=r"page\.md:2: exit 1"):
         type_page(page, folder, environment(), tmp_path)
 
 
