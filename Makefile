@@ -102,9 +102,10 @@ format: $(DEVELOPMENT)
 docs: $(RUNTIME) $(DOCUMENTATION)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
-# What the pages tell to type, the longest first, and the notebooks; all else of tests/docs is in `make test`.
+# What the pages tell to type, the longest first, and the notebooks; blocks that are marked as nightly are in
+# `make test-slow`, all else of tests/docs is in `make test`.
 docs-check: $(DEVELOPMENT)
-	$(PYTEST:worksteal=load) --maxschedchunk 1 tests/docs -m slow
+	$(PYTEST:worksteal=load) --maxschedchunk 1 tests/docs -m "slow and not nightly"
 
 bench: $(DEVELOPMENT)
 	$(VENV)/bin/evermap bench

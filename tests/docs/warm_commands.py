@@ -1,13 +1,14 @@
-"""The command `evermap` for the documents' checks: copies of a process that has imported it and loaded its kernels.
+"""The commands `evermap` and `python -c` for the documents' checks: copies of a process that has loaded the kernels.
 
 Of the seconds of most commands of the pages, the greater part goes into imports and into loading machine code, a
 hundred times the same. So one process does that, and each command is a fork of it, with the folder, the environment
 and the streams of its caller, and ends as the installed command does. It is `evermap.__main__.run` in both; that this
-starts in a fresh process is what the README's commands show, which are run without this.
+starts in a fresh process is what the README's first commands show, and the notebooks, which are run without this.
 """
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import json
 import os
@@ -22,9 +23,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import ModuleType
 
 SHIM = """#!{python} -IS
 import json, os, socket, sys
+if sys.argv[0].endswith("python") and (len(sys.argv) != 3 or sys.argv[1] != "-c"):
+    os.execv({python!r}, [{python!r}, *sys.argv[1:]])
 with socket.socket(socket.AF_UNIX) as to:
     to.connect({address!r})
     socket.send_fds(to, [b"-"], [0, 1, 2])
@@ -32,7 +36,7 @@ with socket.socket(socket.AF_UNIX) as to:
     to.shutdown(socket.SHUT_WR)
     sys.exit(int(to.recv(8) or b"70"))
 """
-"""What stands for the installed command; an answer that does not come is a failure of the machinery: 70."""
+"""What takes the place of the installed commands; an answer that does not come is a failure of the machinery: 70."""
 
 
 @contextmanager
@@ -64,10 +68,12 @@ def warm_commands(environment: dict[str, str], shared: Path) -> Iterator[dict[st
 
 
 def _begin(folder: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
-    """Start the process that answers, and put the command that asks it into the folder."""
-    address, shim = folder / "socket", folder / "evermap"
-    shim.write_text(SHIM.format(python=sys.executable, address=str(address)), encoding="utf-8")
-    shim.chmod(shim.stat().st_mode | stat.S_IXUSR)
+    """Start the process that answers, and put the commands that ask it into the folder."""
+    address = folder / "socket"
+    for name in ("evermap", "python"):
+        shim = folder / name
+        shim.write_text(SHIM.format(python=sys.executable, address=str(address)), encoding="utf-8")
+        shim.chmod(shim.stat().st_mode | stat.S_IXUSR)
     process = subprocess.Popen(
         [sys.executable, __file__, str(address)], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
     )
@@ -107,10 +113,36 @@ def answer(caller: socket.socket) -> None:
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
-    sys.argv = argv
-    from evermap.__main__ import run
+    if argv[0].endswith("python"):
+        run_text(argv[2])
+    else:
+        sys.argv = argv
+        from evermap.__main__ import run
 
-    run()
+        run()
+
+
+def run_text(text: str) -> None:
+    """Run a program as `python -c` does: as the module `__main__`, with the folder's modules before all others.
+
+    It ends without taking down all that was loaded, which takes 2 s.
+    """
+    code = 1
+
+    def end() -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+    atexit.register(end)  # what the program registers is called before
+    sys.argv, sys.path[0] = ["-c"], ""
+    main = sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        exec(compile(text, "<string>", "exec"), vars(main))
+        code = 0
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        raise
 
 
 def serve(address: str) -> None:
