@@ -179,10 +179,10 @@ def _leave_out_carried(
 ) -> tuple[_Case, SlamResult, SessionSolution[Visit], tuple[Cause, ...]]:
     """Return case, result and solution without landmarks that are carried about, where there are any, and which."""
     from evermap.explain.carried import Carried, find_carried, name_carried
-    from evermap.slam.votes import without_identities
+    from evermap.slam.votes import with_read_identities, without_identities
 
     def find(result: SlamResult, solution: SessionSolution[Visit]) -> tuple[Carried, ...]:
-        return find_carried(result, _with_read_names(solution.asked.inputs.recording, case.read), case.prior_map)
+        return find_carried(result, with_read_identities(solution.asked.inputs.recording, case.read), case.prior_map)
 
     as_given = case, result, solution, ()
     if case.config.slam.unknown_ids is True or not (suspects := find(result, solution)):
@@ -195,14 +195,6 @@ def _leave_out_carried(
     if tuple(one.landmark_id for one in confirmed) != names:
         return as_given
     return without, result, solution, tuple(name_carried(one, case.read) for one in confirmed)
-
-
-def _with_read_names(recording: AnyRecording, read: AnyRecording) -> AnyRecording:
-    """Return a recording as it was put right (its stamps, axes, signs), with the identities that were read."""
-    if len(recording.detections) != len(read.detections):
-        return read
-    named = replace(recording.detections, landmark_id=read.detections.landmark_id)
-    return replace(recording, detections=named)
 
 
 def _without_changes(config: Config) -> Config:

@@ -77,6 +77,13 @@ def without_identities(recording: Any, landmark_id: Collection[int]) -> Any:
     return replace(recording, detections=replace(seen, landmark_id=name))
 
 
+def with_read_identities(recording: Any, read: Any) -> Any:
+    """Return a recording as it was put right (stamps, axes, signs), with the identities of the one that was read."""
+    if len(recording.detections) != len(read.detections):
+        return read
+    return replace(recording, detections=replace(recording.detections, landmark_id=read.detections.landmark_id))
+
+
 def list_doubled_ids(as_read: AnyRecording, recording: AnyRecording) -> IntArray:
     """Return ids that a recording has not any more, and that were read twice in one frame, time and again.
 
