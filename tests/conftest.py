@@ -14,7 +14,8 @@ import typer.testing
 from hypothesis import settings
 
 # an example may take as long as it takes: a slow machine, or a kernel that is compiled first, is no failure; all tests,
-# the slow ones too, try eight times as many. A test has a number of its own only where an example is dear
+# the slow ones too, try eight times as many. A test has a number of its own, or a share of this one, only
+# where an example is dear
 settings.register_profile("quick", deadline=None, max_examples=25)
 settings.register_profile("whole", deadline=None, max_examples=200)
 settings.load_profile("quick")

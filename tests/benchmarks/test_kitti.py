@@ -49,7 +49,7 @@ size = st.floats(0.3, 4.0)
 boxes = st.tuples(number, number, number, size, size, size, st.floats(-7.0, 7.0)).map(np.array)
 
 
-@settings(max_examples=10)
+@settings(max_examples=settings.default.max_examples * 2 // 5)
 @given(boxes, boxes)
 def test_overlap_is_that_of_halfspaces(a: np.ndarray, b: np.ndarray) -> None:
     shared = volume_by_scipy(a, b)

@@ -281,7 +281,9 @@ def recordings(draw: st.DrawFn) -> Recording:
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
-@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=settings.default.max_examples * 2 // 5, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(recording=recordings())
 def test_what_is_written_reads_back_the_same(
     recording: Recording, form: str, tmp_path: Path, assert_same: Callable, check_recording: Callable

@@ -119,7 +119,7 @@ def test_what_agrees_with_what_stands_is_added_together(monkeypatch: pytest.Monk
     assert len(asked) <= 8
 
 
-@settings(max_examples=5)
+@settings(max_examples=settings.default.max_examples // 5)
 @given(
     st.integers(0, 2**32 - 1), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0), st.floats(-np.pi, np.pi)
 )  # fmt: skip

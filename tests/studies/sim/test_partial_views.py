@@ -219,7 +219,7 @@ def test_clutter_comes_and_goes_quickly_and_is_many(building: BuildingSimulation
     assert np.isin(moved, crates).mean() > 0.6
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=settings.default.max_examples // 4, deadline=None)
 @given(
     seed=st.integers(0, 1000),
     width_m=st.floats(7.0, 16.0),

@@ -127,7 +127,7 @@ def test_demo_size():
     assert {event.kind.value for event in simulation.events} >= {"moved", "vanished", "returned", "opened", "closed"}
 
 
-@settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=settings.default.max_examples * 2 // 5, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**63),
     length_m=st.floats(21.0, 60.0),
@@ -165,7 +165,7 @@ def test_any_config_in_range_gives_finite_recordings(
         assert np.all((pose[:, :2] > 0.0) & (pose[:, :2] < [length_m, depth_m]))
 
 
-@settings(max_examples=8)
+@settings(max_examples=settings.default.max_examples // 3)
 @given(
     seed=st.integers(0, 1000),
     depth_m=st.floats(13.0, 30.0),

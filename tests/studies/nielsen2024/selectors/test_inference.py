@@ -41,7 +41,7 @@ def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, n
     np.testing.assert_allclose(found, joint, atol=1e-9)
 
 
-@settings(max_examples=10)
+@settings(max_examples=settings.default.max_examples * 2 // 5)
 @given(looks(), chains)
 def test_posteriors_and_evidence_are_sums_over_all_sequences(looks, name):
     chain = CHAINS[name]

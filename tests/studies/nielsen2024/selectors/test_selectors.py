@@ -38,7 +38,7 @@ def test_same_seed_same_selection_of_modes_that_exist(looks, chain, name, seed):
     np.testing.assert_array_equal(first.log_joint, log_joint(looks, CHAINS[chain], first.indicator))
 
 
-@settings(max_examples=5)
+@settings(max_examples=settings.default.max_examples // 5)
 @given(looks(longest=12), chains, st.integers(0, 1000))
 def test_no_selector_exceeds_viterbi(looks, chain, seed):
     best = selector_by_name("viterbi").select(looks, CHAINS[chain], np.random.default_rng(0)).log_joint
