@@ -32,7 +32,7 @@ import evermap as em
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.slam.ownership import find_owned
-from evermap.types import UNKNOWN, AnyRecording, ChangeKind, MapChange, SlamResult, rows_of
+from evermap.types import UNKNOWN, AnyRecording, ChangeKind, IntArray, MapChange, SlamResult, rows_of
 from evermap_studies.worlds.yard import SENSOR_HEIGHT_M, STEP_S, YardConfig, YardDrive, flatten, simulate_yard
 
 BODIES = "stated", "boxes", "motion"
@@ -131,15 +131,25 @@ def _bodies_of(change: MapChange, drive: YardDrive) -> set[int]:
     return found if len(known) == len(change.landmark_ids) else {*found, -1}
 
 
+def group_owners(drive: YardDrive, landmark_id: IntArray, object_id: IntArray) -> list[list[int]]:
+    """Return the forklifts (-1 for walls) that the landmarks (K,) of each body (K,) are on."""
+    forklift = drive.body_of_tag[landmark_id]
+    return [forklift[object_id == one].tolist() for one in np.unique(object_id)]
+
+
+def is_pure(groups: list[list[int]]) -> bool:
+    """Return whether every body has landmarks of one forklift only."""
+    return all(len(set(one)) == 1 and -1 not in one for one in groups)
+
+
 def count_owned(drive: YardDrive, recording: AnyRecording) -> list[int]:
     """Return numbers of tags seen on forklifts, of those that are found to be on bodies, and of wrong bodies."""
     seen = np.unique(drive.recording.detections.landmark_id)
     seen = seen[seen != UNKNOWN]
     found = find_owned(recording, em.Config())
-    forklift = drive.body_of_tag[found.landmark_id]
-    groups = [set(forklift[found.object_id == one].tolist()) for one in np.unique(found.object_id)]
-    wrong = sum(len(one) > 1 or -1 in one for one in groups)
-    return [int((drive.body_of_tag[seen] >= 0).sum()), int((forklift >= 0).sum()), wrong]
+    wrong = sum(not is_pure([one]) for one in group_owners(drive, found.landmark_id, found.object_id))
+    on_forklifts = (drive.body_of_tag[names] >= 0 for names in (seen, found.landmark_id))
+    return [*(int(one.sum()) for one in on_forklifts), wrong]
 
 
 def find_owners(usual: YardConfig, seeds: range) -> None:
@@ -177,8 +187,11 @@ def main() -> None:
         boxed=asked.bodies == "boxes",
     )  # fmt: skip
     seeds = range(asked.first, asked.first + asked.seeds)
-    if asked.map or asked.owners:
-        (enter_drives if asked.map else find_owners)(usual, seeds)
+    if asked.map:
+        enter_drives(usual, seeds)
+        return
+    if asked.owners:
+        find_owners(usual, seeds)
         return
     rows = []
     print("seed  standing  moving  without: moving  standing  changes  false  verdicts")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.yard import error_m, is_true
+from benchmarks.yard import error_m, group_owners, is_pure, is_true
 
 import evermap as em
 from evermap.config import Config
@@ -15,7 +15,7 @@ from evermap.slam.co_motion import Movers, Reckoned, find_movers, locate_by_odom
 from evermap.slam.ownership import OWNED, PRIOR, find_links, find_owned, weigh_looks, with_owned
 from evermap.slam.space.box_owners import Sights, see_boxes
 from evermap.slam.space.moving import is_located
-from evermap.types import UNKNOWN, IntArray, SpatialRecording, rows_of
+from evermap.types import UNKNOWN, SpatialRecording, rows_of
 from evermap_studies.worlds.yard import YardConfig, YardDrive, simulate_yard
 
 UNSTATED = YardConfig(moving=6, parked=0, stated=False)
@@ -28,11 +28,6 @@ def movers_of(recording: SpatialRecording) -> Movers | None:
     seen = locate_by_odometry(recording, Config().slam.space)
     assert seen is not None
     return find_movers(seen, Config())
-
-
-def groups_of(drive: YardDrive, objects: IntArray) -> list[set[int]]:
-    """The forklifts (-1 for walls) that the landmarks of each body are on."""
-    return [set(drive.body_of_tag[objects[objects[:, 1] == one, 0]].tolist()) for one in np.unique(objects[:, 1])]
 
 
 def sights(within: list[bool], place: list[int], every_s: float = 1.0) -> Sights:
@@ -75,7 +70,7 @@ def test_the_odds_of_membership_are_those_of_two_explanations() -> None:
 def test_boxes_own_the_tags_within_them(seed: int) -> None:
     drive = simulate_yard(BOXED, seed)[0]
     found, remarks = with_owned(drive.recording, Config())
-    assert all(len(one) == 1 and one != {UNKNOWN} for one in groups_of(drive, found.objects))
+    assert is_pure(group_owners(drive, *found.objects.T))
     seen = np.unique(drive.recording.detections.landmark_id)
     carried = seen[(seen >= 0) & (drive.body_of_tag[seen] >= 0)]
     assert len(found.objects) > 0.6 * len(carried)

@@ -151,8 +151,8 @@ def since(lit: LivingMap) -> Session:
     return run_session(drive(1, make=LASER, happen=wrong.vanishes(2)), lit)
 
 
-@pytest.fixture(scope="module")
-def believed(lit: LivingMap) -> Session:
+@pytest.fixture(scope="module", name="believed")
+def enter_refused_drive(lit: LivingMap) -> Session:
     """The drive that is refused, in a map that takes any."""
     return run_session(make_refused_drive(), lit, ANY)
 

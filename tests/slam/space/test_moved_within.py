@@ -253,7 +253,7 @@ def test_what_is_at_one_place_of_an_optimum_is_asked_once(monkeypatch):
 
 
 @cache
-def solved_poses() -> SpatialProblem:
+def solve_poses() -> SpatialProblem:
     """What is solved of a drive on which nothing moved."""
     recording = as_poses(tagged_corridor(3), 3)
     return solve_space(prepare_space(recording, Config().slam.space), None).optimum.smoother.problem
@@ -272,7 +272,7 @@ def solved_poses() -> SpatialProblem:
 )
 def test_outliers_in_a_row_of_one_place_have_one_reason(every_s, places, persist_s, share, count):
     """How many independent outliers eight count as that alternate between places. Else one long bad view is a move."""
-    problem = solved_poses()
+    problem = solve_poses()
     rows = np.arange(8)
     row = replace(
         problem, stamp_s=every_s * np.arange(len(problem.stamp_s)), pose_row=np.arange(len(problem.pose_row)),
