@@ -21,6 +21,7 @@ from evermap.metrics.summary import compare_with_truth
 from evermap.slam.correlation import Lasting
 from evermap.slam.space import moved_within
 from evermap.slam.space.against_map import MapComparison
+from evermap.slam.space.estimate import SpatialOptimum
 from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, has_moved
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.marginal import _cost_of_outliers
@@ -312,3 +313,30 @@ def test_what_is_at_one_place_in_the_end_did_not_move():
     assert has_moved(both, move)
     place[3] = se3.compose(place[2], se3.from_angles([0.0, 0.0, 0.2]))
     assert has_moved(both, move)
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow), 7])
+@pytest.mark.parametrize("by_m", [0.0, 0.5])
+def test_errors_that_last_move_nothing_that_is_seen_twice(by_m, seed):
+    """A tag that has another identity on the way back, seen for some 3 s on either way with errors of 3 cm that persist
+    for 5 s: they put it at places 13 cm apart, which a dozen sightings that err by themselves would not.
+    """
+    moves = (Move(5, 20.0, (by_m, 0.0, 0.0)),)
+    world = tagged_corridor(seed, odometry=False, moves=moves)
+    recording = err_for_a_while(rename_moved(as_poses(world, seed, 0.005), moves), persist_s=5.0, sigma_m=0.03)
+    others = world.tags[np.delete(np.arange(12), 5)]  # hold the poses
+    solved = solve_space(prepare_space(recording, Config().slam.space), others.as_prior(0.01)).optimum
+    each = SpatialOptimum(solved.estimate, solved.noise, *solved.last)  # as the search sees it: detections count as one
+    assert has_moved(each, moved_within.MovedWithin(5, 12, 20.0, (19.0, 21.0), 1.0)) == (by_m > 0.0)
+
+
+def err_for_a_while(recording: SpatialRecording, persist_s: float, sigma_m: float) -> SpatialRecording:
+    """The same sightings, where errors of each tag's position have an exponential correlation over time."""
+    seen, random = recording.detections, np.random.default_rng(1)
+    stamp_s, off = recording.frames.stamp_s[seen.frame], np.zeros((len(seen), 3))
+    for tag in np.unique(seen.landmark_id):
+        mine = np.flatnonzero(seen.landmark_id == tag)
+        lag_s = np.abs(stamp_s[mine, None] - stamp_s[mine])
+        root = np.linalg.cholesky(np.exp(-lag_s / persist_s) + 1e-9 * np.eye(len(mine)))
+        off[mine] = sigma_m * root @ random.normal(size=(len(mine), 3))
+    return replace(recording, detections=replace(seen, position_sensor_m=seen.position_sensor_m + off))

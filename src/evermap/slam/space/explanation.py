@@ -15,7 +15,7 @@ from evermap.config import ChangesConfig
 from evermap.geometry import se3
 from evermap.slam.correlation import Lasting
 from evermap.slam.space.against_map import MapComparison, MovedTogether, compared, log_map_density
-from evermap.slam.space.estimate import SpatialOptimum, converge
+from evermap.slam.space.estimate import SpatialOptimum, converge, with_worth
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_groups import find_moved_groups
 from evermap.slam.space.moved_within import ROUNDS, MovedWithin, find_two_places, list_movers
@@ -101,7 +101,10 @@ def has_moved(optimum: SpatialOptimum, move: MovedWithin) -> bool:
     """Return whether the two places of a landmark are still two, with all that was found after it.
 
     What moved first bends the poses beside it, until all of it is found: what stands there seems to have moved, too.
+    Both places are as uncertain as detections of a view that err alike leave them: else what stands has moved wherever
+    it is seen from two sides.
     """
+    optimum = with_worth(optimum)
     problem, both = optimum.smoother.problem, np.array([move.before, move.after])
     before, after = optimum.estimate.place[both[:, None]]
     off = (after - before)[0, :3]
