@@ -20,7 +20,7 @@ from evermap.io.map_formats import read_map_file
 from evermap.metrics.summary import compare_with_truth
 from evermap.slam.correlation import Lasting
 from evermap.slam.space import moved_within
-from evermap.slam.space.against_map import MapComparison
+from evermap.slam.space.against_map import AS_STATED, MapComparison
 from evermap.slam.space.estimate import SpatialOptimum
 from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, has_moved
 from evermap.slam.space.intake import prepare_space
@@ -212,7 +212,7 @@ def test_nothing_moved_where_the_camera_is_late_or_identities_are_wrong(seed, la
 def test_a_map_of_which_most_is_elsewhere_is_in_doubt_not_its_landmarks(n_off: int, is_in_doubt: bool) -> None:
     """Of ten places of a map; without a map nothing contradicts it."""
     p_stands = np.where(np.arange(10) < n_off, 0.49, 0.51)
-    found = MapComparison(p_stands, np.zeros((10, 6)), np.zeros((10, 6, 6)), 1.0)
+    found = MapComparison(p_stands, np.zeros((10, 6)), np.zeros((10, 6, 6)), AS_STATED)
     unused: Any = None
     assert _contradicts_map(SpatialExplanation(unused, np.arange(10), (), found)) is is_in_doubt
     assert not _contradicts_map(SpatialExplanation(unused, np.arange(10), (), None))

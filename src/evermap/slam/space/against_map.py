@@ -55,27 +55,6 @@ class MovedTogether(NamedTuple):
     probability: float
 
 
-@dataclass(frozen=True, slots=True)
-class MapComparison:
-    """Comparison of the map's places with those of the session.
-
-    Attributes:
-        p_stands: (K,) probability that each is where the map has it.
-        off: (K, 6) twist from where the map has it to where it is, by the session and the other places.
-        covariance: (K, 6, 6) of that.
-        factor: by which the map's stated standard deviations were multiplied.
-        groups: places that moved together, by the joint search.
-        misread: (K,) log density of all detections of each being of something else.
-    """
-
-    p_stands: FloatArray
-    off: FloatArray
-    covariance: FloatArray
-    factor: float
-    groups: tuple[MovedTogether, ...] = ()
-    misread: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-
 class Accuracy(NamedTuple):
     """How far places that stand are from where the map has them.
 
@@ -92,6 +71,31 @@ class Accuracy(NamedTuple):
         return Accuracy(float(np.sqrt(self.factor * other.factor)), 0.5 * (self.alike + other.alike))
 
 
+AS_STATED = Accuracy(1.0, 0.0)
+"""That of a map that is as accurate as it says, by detections that err by themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapComparison:
+    """Comparison of the map's places with those of the session.
+
+    Attributes:
+        p_stands: (K,) probability that each is where the map has it.
+        off: (K, 6) twist from where the map has it to where it is, by the session and the other places.
+        covariance: (K, 6, 6) of that.
+        accuracy: how far places that stand are from there.
+        groups: places that moved together, by the joint search.
+        misread: (K,) log density of all detections of each being of something else.
+    """
+
+    p_stands: FloatArray
+    off: FloatArray
+    covariance: FloatArray
+    accuracy: Accuracy
+    groups: tuple[MovedTogether, ...] = ()
+    misread: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
 def compared(
     optimum: SpatialOptimum, stated: FloatArray, groups: tuple[MovedTogether, ...] = ()
 ) -> tuple[SpatialOptimum, MapComparison]:
@@ -102,15 +106,19 @@ def compared(
         stated: (K, 6) standard deviations of the map's places.
         groups: places that are known to have moved.
     """
-    problem, shared, begun = optimum.smoother.problem, _measure_shared_errors(optimum), optimum.noise
+    problem, shared, begun = (
+        optimum.smoother.problem,
+        measure_shared_errors(optimum, optimum.smoother.problem.prior.place),
+        optimum.noise,
+    )
 
     def judge(found: MapComparison, accuracy: Accuracy) -> MapComparison:
         found = _judge_places(problem, found, accuracy.factor * stated, accuracy.alike**2 * shared)
         for group in groups:  # other sets of changes are worlds of their own, not this one with half a map
             found.p_stands[group.members] = 0.0
-        return replace(found, factor=accuracy.factor)
+        return replace(found, accuracy=accuracy)
 
-    found = judge(_predict_places(optimum), Accuracy(1.0, 0.0))
+    found = judge(_predict_places(optimum), AS_STATED)
     tried, is_held = list[Accuracy](), False
     for _ in range(ROUNDS):
         accuracy = tried[-1] if is_held else _accuracy(found, stated, shared, problem)
@@ -153,17 +161,21 @@ def _weigh_places(found: MapComparison, sigma: FloatArray, before: FloatArray) -
     return np.where(waits, before, np.maximum(found.p_stands, LEAST_WEIGHT))
 
 
-def _measure_shared_errors(optimum: SpatialOptimum) -> FloatArray:
+def measure_shared_errors(optimum: SpatialOptimum, places: IntArray) -> FloatArray:
     """Return the covariances (K, 6, 6) of errors that all detections of a place have in common, if these are as large
     as those of one detection. With odometry, what lasts is part of what detections are worth.
+
+    Args:
+        optimum: the solution.
+        places: (K,) rows of the places.
     """
     problem, now = optimum.smoother.problem, optimum.now
-    found = np.zeros((len(problem.prior.place), 6, 6))
+    found = np.zeros((len(places), 6, 6))
     if not shows_errors(problem):
         return found
     count = np.bincount(problem.place, now.weight * problem.share, minlength=len(problem.oriented))
     information = optimum.smoother.information_of_places(now)
-    for k, place in enumerate(problem.prior.place.tolist()):
+    for k, place in enumerate(places.tolist()):
         own = information[place] / max(count[place], 1e-9)
         found[k, : len(own), : len(own)] = np.linalg.inv(own + LEAST_INFORMATION * np.eye(len(own)))
     return found
@@ -186,7 +198,7 @@ def _predict_places(optimum: SpatialOptimum) -> MapComparison:
         values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
         alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
         off[k, :dim], covariance[k, :dim, :dim] = alone @ (own @ mean), alone
-    return MapComparison(np.ones(count), off, covariance, 1.0, misread=misread[prior.place])
+    return MapComparison(np.ones(count), off, covariance, AS_STATED, misread=misread[prior.place])
 
 
 def _judge_places(

@@ -14,7 +14,13 @@ import numpy as np
 from evermap.config import ChangesConfig
 from evermap.geometry import se3
 from evermap.slam.correlation import Lasting
-from evermap.slam.space.against_map import MapComparison, MovedTogether, compared, log_map_density
+from evermap.slam.space.against_map import (
+    MapComparison,
+    MovedTogether,
+    compared,
+    log_map_density,
+    measure_shared_errors,
+)
 from evermap.slam.space.estimate import SpatialOptimum, converge, with_worth
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_groups import find_moved_groups
@@ -90,19 +96,25 @@ def explain_places(
                 probability = 1.0 / (1.0 + math.exp(-min(nats, two.nats)))
                 trial = replace(trial, moves=(*found.moves, move._replace(probability=probability)))
             found, begun, identity, single = trial, two.optimum, larger, frozenset()
-    stood = [move for move in found.moves if not has_moved(found.optimum, move)]
+    alike = 0.0 if found.from_map is None else found.from_map.accuracy.alike
+    stood = [move for move in found.moves if not has_moved(found.optimum, move, alike)]
     if not stood:
         return found
     moves = tuple(move for move in found.moves if move not in stood)
     return _explain_with(found.optimum, found.identity, moves, whole, stated, changes, of_bodies)
 
 
-def has_moved(optimum: SpatialOptimum, move: MovedWithin) -> bool:
+def has_moved(optimum: SpatialOptimum, move: MovedWithin, alike: float = 0.0) -> bool:
     """Return whether the two places of a landmark are still two, with all that was found after it.
 
     What moved first bends the poses beside it, until all of it is found: what stands there seems to have moved, too.
     Both places are as uncertain as detections of a view that err alike leave them: else what stands has moved wherever
     it is seen from two sides.
+
+    Args:
+        optimum: with both places.
+        move: from one to the other.
+        alike: errors that all detections of a place have in common, over those of one (`Accuracy`).
     """
     optimum = with_worth(optimum)
     problem, both = optimum.smoother.problem, np.array([move.before, move.after])
@@ -112,6 +124,7 @@ def has_moved(optimum: SpatialOptimum, move: MovedWithin) -> bool:
         off = se3.local(problem.symmetries[both[:1]].nearest(before, after), after)[0]
     dim = len(off)
     spread = optimum.smoother.spread(optimum.now).of(len(problem.stamp_s) + both, dim).sum(axis=0)
+    spread += alike**2 * measure_shared_errors(optimum, both)[:, :dim, :dim].sum(axis=0)
     return bool(0.5 * off @ np.linalg.solve(spread, off) > dim + problem.settings.repair.gain_nats)
 
 
