@@ -22,7 +22,7 @@ from evermap.slam.correlation import Lasting
 from evermap.slam.space import moved_within
 from evermap.slam.space.against_map import AS_STATED, MapComparison
 from evermap.slam.space.estimate import SpatialOptimum
-from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, has_moved
+from evermap.slam.space.explanation import SpatialExplanation, _contradicts_map, find_p_apart
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.marginal import _cost_of_outliers
 from evermap.slam.space.problem import SpatialNoise, SpatialProblem
@@ -305,14 +305,14 @@ def test_what_is_at_one_place_in_the_end_did_not_move():
     place = optimum.estimate.place.copy()
     both = replace(optimum, estimate=replace(optimum.estimate, place=place))
     move = moved_within.MovedWithin(2, 3, 1.0, (0.0, 2.0), 1.0)
-    assert has_moved(both, move)
+    assert find_p_apart(both, move) > 0.99
     place[3] = place[2]
     place[3, 0] += 0.001
-    assert not has_moved(both, move)
+    assert find_p_apart(both, move) < 0.1
     place[3, 0] += 0.1
-    assert has_moved(both, move)
+    assert find_p_apart(both, move) > 0.99
     place[3] = se3.compose(place[2], se3.from_angles([0.0, 0.0, 0.2]))
-    assert has_moved(both, move)
+    assert find_p_apart(both, move) > 0.99
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow), 7])
@@ -327,7 +327,8 @@ def test_errors_that_last_move_nothing_that_is_seen_twice(by_m, seed):
     others = world.tags[np.delete(np.arange(12), 5)]  # hold the poses
     solved = solve_space(prepare_space(recording, Config().slam.space), others.as_prior(0.01)).optimum
     each = SpatialOptimum(solved.estimate, solved.noise, *solved.last)  # as the search sees it: detections count as one
-    assert has_moved(each, moved_within.MovedWithin(5, 12, 20.0, (19.0, 21.0), 1.0)) == (by_m > 0.0)
+    p_moved = find_p_apart(each, moved_within.MovedWithin(5, 12, 20.0, (19.0, 21.0), 1.0))
+    assert p_moved > 0.99 if by_m > 0.0 else p_moved < 0.1
 
 
 def err_for_a_while(recording: SpatialRecording, persist_s: float, sigma_m: float) -> SpatialRecording:

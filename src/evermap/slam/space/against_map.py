@@ -216,10 +216,24 @@ def _judge_places(
     for k, dim in enumerate(np.where(problem.oriented[problem.prior.place], 6, 3).tolist()):
         mean, alone = found.off[k, :dim], found.covariance[k, :dim, :dim]
         wide = np.asarray(alone + np.diag(sigma[k, :dim] ** 2) + shared[k, :dim, :dim], dtype=np.float64)
-        stands, moved = np.logaddexp(_log_density(mean, wide), found.misread[k]), _log_moved(mean, wide, settings)
-        odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
-        p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
+        p_stands[k] = find_p_stands(mean, wide, settings, found.misread[k])
     return replace(found, p_stands=p_stands)
+
+
+def find_p_stands(
+    off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig, log_misread: float = -np.inf
+) -> float:
+    """Return the probability that a place stands which is `off` (D,) by a covariance (D, D), over that it moved.
+
+    Args:
+        off: how far it is from where it was [m], and by which rotation vector it is turned [rad].
+        covariance: of that.
+        settings: how far things move, and how often.
+        log_misread: log density of all of its detections being of something else, as of `_log_density`.
+    """
+    stands, moved = np.logaddexp(_log_density(off, covariance), log_misread), _log_moved(off, covariance, settings)
+    odds = moved - stands + np.log(settings.p_moved / (1.0 - settings.p_moved))
+    return float(1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0))))
 
 
 def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: FloatArray) -> float:

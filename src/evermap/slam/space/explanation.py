@@ -18,6 +18,7 @@ from evermap.slam.space.against_map import (
     MapComparison,
     MovedTogether,
     compared,
+    find_p_stands,
     log_map_density,
     measure_shared_errors,
 )
@@ -97,15 +98,20 @@ def explain_places(
                 trial = replace(trial, moves=(*found.moves, move._replace(probability=probability)))
             found, begun, identity, single = trial, two.optimum, larger, frozenset()
     alike = 0.0 if found.from_map is None else found.from_map.accuracy.alike
-    stood = [move for move in found.moves if not has_moved(found.optimum, move, alike)]
-    if not stood:
-        return found
-    moves = tuple(move for move in found.moves if move not in stood)
+    p_moved = [find_p_apart(found.optimum, move, alike) for move in found.moves]
+    told = [p >= begun.smoother.problem.settings.map.p_told for p in p_moved]
+    moves = tuple(
+        move._replace(probability=min(move.probability, p))
+        for move, p, is_told in zip(found.moves, p_moved, told, strict=True)
+        if is_told
+    )
+    if all(told):
+        return replace(found, moves=moves)
     return _explain_with(found.optimum, found.identity, moves, whole, stated, changes, of_bodies)
 
 
-def has_moved(optimum: SpatialOptimum, move: MovedWithin, alike: float = 0.0) -> bool:
-    """Return whether the two places of a landmark are still two, with all that was found after it.
+def find_p_apart(optimum: SpatialOptimum, move: MovedWithin, alike: float = 0.0) -> float:
+    """Return the probability that the two places of a landmark are still apart, with all that was found after it.
 
     What moved first bends the poses beside it, until all of it is found: what stands there seems to have moved, too.
     Both places are as uncertain as detections of a view that err alike leave them: else what stands has moved wherever
@@ -125,7 +131,7 @@ def has_moved(optimum: SpatialOptimum, move: MovedWithin, alike: float = 0.0) ->
     dim = len(off)
     spread = optimum.smoother.spread(optimum.now).of(len(problem.stamp_s) + both, dim).sum(axis=0)
     spread += alike**2 * measure_shared_errors(optimum, both)[:, :dim, :dim].sum(axis=0)
-    return bool(0.5 * off @ np.linalg.solve(spread, off) > dim + problem.settings.repair.gain_nats)
+    return 1.0 - find_p_stands(off, spread, problem.settings.map)
 
 
 def _explain_with(
