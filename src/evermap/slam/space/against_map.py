@@ -383,27 +383,27 @@ def evidence_against(optimum: SpatialOptimum, stated: FloatArray) -> AgainstMap:
     known = problem.symmetries[seen].nearest(prior.pose[row], place)
     unknown = turned & (stated[row, 3:] >= ANY_RAD).all(axis=1)
     known[unknown, 3:] = place[unknown, 3:]  # of which the map says nothing
-    position, onto = np.zeros((len(row), numbers)), np.zeros((numbers * len(row), len(joint)))
+    some = vectors[:, values > LOOSE]
+    position, told = np.zeros((len(row), numbers)), np.zeros((numbers * len(row), some.shape[1]))
     mean, covariance = np.zeros((len(row), numbers)), np.tile(np.eye(numbers), (len(row), 1, 1))
     position[:, :3], mean[:, :3] = place[:, :3], known[:, :3]
     for k, oriented in enumerate(turned.tolist()):
         at, own, to = numbers * k, int(begin[k]), se3.rotation_of(place[k]) if oriented else np.eye(3)
-        onto[at : at + 3, own : own + 3] = to  # forces turn as shifts do
+        told[at : at + 3] = to @ some[own : own + 3]  # forces turn as shifts do
         covariance[k, :3, :3] = np.diag(stated[row[k], :3] ** 2)
         if oriented:
             twist = se3.log(se3.compose(place[k], se3.inverse(known[k]))) * np.repeat([0.0, 1.0], 3)
             position[k, 3:] = twist[3:]
             jacobian = se3.right_jacobian_inverse(twist)[3:, 3:].T @ to  # from a turn in its own axes
-            onto[at + 3 : at + 6, own + 3 : own + 6] = np.linalg.inv(jacobian).T
+            told[at + 3 : at + 6] = np.linalg.inv(jacobian).T @ some[own + 3 : own + 6]
             axes = se3.rotation_of(known[k])
             covariance[k, 3:, 3:] = (axes * stated[row[k], 3:] ** 2) @ axes.T
-    told = onto @ vectors[:, values > LOOSE]
     evidence = WindowEvidence(
         landmark=np.arange(len(row)),
         window=np.zeros(len(row), dtype=np.int64),
         position=position,
         information=(told * values[values > LOOSE]) @ told.T,
-        pull=told @ (vectors[:, values > LOOSE].T @ pull),
+        pull=told @ (some.T @ pull),
         log_scale_sigma=0.0,
     )
     return AgainstMap(row, evidence, GivenMap(mean, covariance, np.ones(len(row), dtype=np.bool_)))

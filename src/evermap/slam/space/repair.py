@@ -57,36 +57,41 @@ def _with_one_turned(optimum: SpatialOptimum) -> SpatialOptimum:
     Poses from which little else is seen follow a wrong orientation, so that no vote at their optimum tells of it.
     """
     smoother, noise, gain_nats = optimum.smoother, optimum.noise, optimum.smoother.problem.settings.repair.gain_nats
-    starts = [replace(optimum.estimate, place=place) for place in _turn_places(optimum)]
-    cost = [smoother.linearised(start, noise, heavy=False).cost for start in starts]
-    for k in np.argsort(cost, kind="stable")[:MOST_TURNED].tolist():
-        wanted = optimum.now.cost - gain_nats
+    turned, asked = _turn_places(optimum)
+    both = (
+        _losses(smoother.problem, replace(optimum.estimate, place=at), noise) for at in (turned, optimum.estimate.place)
+    )
+    more = smoother.problem.share * np.subtract(*both)
+    cost = np.bincount(smoother.problem.place, more, minlength=len(turned))[asked]
+    wanted = optimum.now.cost - gain_nats
+    for row in asked[np.argsort(cost, kind="stable")[:MOST_TURNED]].tolist():
+        place = optimum.estimate.place.copy()
+        place[row] = turned[row]
         found, there = smoother.optimum(
-            starts[k], noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats, wanted=wanted
-        )
+            replace(optimum.estimate, place=place), noise, heavy=False, iterations=STEPS, settled=ENDING * gain_nats,
+            wanted=wanted,
+        )  # fmt: skip
         if there.cost < wanted:
             return converge(smoother.problem, found, noise, heavy_rounds=0)
     return optimum
 
 
-def _turn_places(optimum: SpatialOptimum) -> list[FloatArray]:
-    """Return places (P, 7), in each of which one is turned as its views say by the explanation that is not taken."""
+def _turn_places(optimum: SpatialOptimum) -> tuple[FloatArray, IntArray]:
+    """Return places (P, 7), turned as their views say by the explanation that is not taken, and rows (K,) of these."""
     problem, estimate, weight = optimum.smoother.problem, optimum.estimate, optimum.now.weight
     sigma = np.hypot(problem.sigma_rad * optimum.noise.pixel, problem.settings.repair.same_rad)
     both = np.stack([as_seen(problem, estimate, measured) for measured in problem.either])
     angle = se3.angle_between(both, estimate.place[problem.place])
     other = np.where((angle[0] < angle[1])[:, None], both[1], both[0])
     asked = np.isfinite(problem.other[:, 3]) & problem.oriented[problem.place]
-    found = list[FloatArray]()
-    for place in np.unique(problem.place[asked]).tolist():
+    turned, rows = estimate.place.copy(), np.unique(problem.place[asked])
+    for place in rows.tolist():
         mine = np.flatnonzero(asked & (problem.place == place))
         mine = mine[:: max(1, len(mine) // MOST_CANDIDATES)]
         off = se3.angle_between(other[mine, None], other[mine]) / sigma[mine]
         best = mine[int(np.argmax(np.exp(-0.5 * off**2) @ weight[mine]))]
-        turned = estimate.place.copy()
         turned[place, 3:] = other[best, 3:]
-        found.append(turned)
-    return found
+    return turned, rows
 
 
 def _locate_again(optimum: SpatialOptimum) -> SpatialEstimate | None:
