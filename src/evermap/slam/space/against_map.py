@@ -19,8 +19,9 @@ from evermap.slam.changes.evidence import WindowEvidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import PLACES, POINTS
 from evermap.slam.space.estimate import SpatialOptimum, converge, with_worth
-from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
+from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialNoise, SpatialProblem
 from evermap.slam.space.range_errors import consider_range_errors, find_range_errors, shows_errors
+from evermap.slam.space.smoother import SpatialSmoother
 from evermap.types import FloatArray, IntArray
 
 ROUNDS = 12
@@ -119,7 +120,7 @@ def compared(
         return replace(found, accuracy=accuracy)
 
     found = judge(_predict_places(optimum), AS_STATED)
-    tried, is_held = list[Accuracy](), False
+    best, tried, is_held = (optimum, found), list[Accuracy](), False
     for _ in range(ROUNDS):
         accuracy = tried[-1] if is_held else _accuracy(found, stated, shared, problem)
         if accuracy in tried[:-1] and accuracy != tried[-1]:  # each of two makes the other the more probable
@@ -137,9 +138,14 @@ def compared(
         held |= bool(np.any(np.abs(error - problem.range_error) > SETTLED_ERROR))
         problem = problem.with_range_error(error)
         before, found = found, judge(_predict_places(optimum), accuracy)
+        spread = square(sigma) + accuracy.alike**2 * shared
+        now, was = (cost_in_map(one, spread, begun) for one in (optimum, best[0]))
+        if now < was + problem.settings.repair.gain_nats:
+            best = optimum, found
         decided = is_held and np.array_equal(found.p_stands < 0.5, before.p_stands < 0.5)
         if not held and (decided or np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED):
             break
+    optimum, found = best  # each place is judged by the others as they are: a few that are wrong may drive out many
     for group in groups:
         found.p_stands[group.members] = 1.0 - group.probability
     return optimum, replace(found, groups=groups)
@@ -154,7 +160,7 @@ def has_contradictions(optimum: SpatialOptimum) -> bool:
 
 def _weigh_places(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
     """Return (K,) weights of the map's places: the farthest moved ones, which may distort others, go first."""
-    spread = found.covariance + sigma[:, :, None] ** 2 * np.eye(6)
+    spread = found.covariance + square(sigma)
     far = np.einsum("ki,kij,kj->k", found.off, np.linalg.inv(spread), found.off)
     moved = (found.p_stands < 0.5) & (before >= 0.5)
     waits = moved & (far < FARTHEST * far[moved].max(initial=0.0))
@@ -236,23 +242,31 @@ def find_p_stands(
     return float(1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0))))
 
 
-def log_density_in_map(problem: SpatialProblem, place: FloatArray, stated: FloatArray) -> float:
-    """Return the log density of places (P, 7) that were seen, in a map of which they stand or moved, up to a constant.
+def square(sigma: FloatArray) -> FloatArray:
+    """Return the covariances (K, D, D) of independent numbers with standard deviations (K, D)."""
+    return np.asarray(sigma[..., None] ** 2 * np.eye(sigma.shape[-1]))
+
+
+def cost_in_map(optimum: SpatialOptimum, spread: FloatArray, noise: SpatialNoise) -> float:
+    """Return the negative log posterior with places of the map that stand or moved, up to a constant.
 
     Args:
-        problem: with the map.
-        place: the places.
-        stated: (K, 6) standard deviations of the map's places.
+        optimum: values.
+        spread: (K, 6, 6) covariances of how far places that stand are from where the map has them.
+        noise: levels, the same for all that are compared.
     """
-    settings, prior, total = problem.settings.map, problem.prior, 0.0
+    problem, place = optimum.smoother.problem, optimum.estimate.place
+    settings, prior = problem.settings.map, problem.prior
+    nothing = replace(problem, prior=replace(prior, weight=np.zeros(len(prior.place))))
+    cost = SpatialSmoother(nothing, optimum.estimate.pose).linearised(optimum.estimate, noise, heavy=False).cost
     seen = np.bincount(problem.place, minlength=len(place))[prior.place] > 0
     for k in np.flatnonzero(seen).tolist():
         row = int(prior.place[k])
         off = problem.off_map(np.array([k]), place[row][None], oriented=bool(problem.oriented[row]))[0]
-        spread = np.diag(np.maximum(stated[k, : len(off)], settings.loose_m) ** 2)
-        stands, moved = _log_density(off, spread), _log_moved(off, spread, settings)
-        total += float(np.logaddexp(np.log1p(-settings.p_moved) + stands, np.log(settings.p_moved) + moved))
-    return total
+        wide = spread[k, : len(off), : len(off)]
+        stands, moved = _log_density(off, wide), _log_moved(off, wide, settings)
+        cost -= float(np.logaddexp(np.log1p(-settings.p_moved) + stands, np.log(settings.p_moved) + moved))
+    return cost
 
 
 def _log_moved(off: FloatArray, covariance: FloatArray, settings: MapInSpaceConfig) -> FloatArray:

@@ -14,10 +14,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from evermap.align.candidates import AGREE_M, Matches, rank_motions
-from evermap.slam.space.against_map import log_density_in_map
+from evermap.slam.space.against_map import cost_in_map, square
 from evermap.slam.space.estimate import SpatialOptimum, converge
-from evermap.slam.space.problem import LEAST_WEIGHT, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.slam.space.smoother import SpatialSmoother
+from evermap.slam.space.problem import LEAST_WEIGHT, PlacePrior, SpatialEstimate, SpatialProblem
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_MOTIONS = 2
@@ -39,6 +38,7 @@ def start_by_consensus(
         stated: (K, 6) standard deviations of the map's places.
     """
     best: tuple[SpatialOptimum, float] | None = None
+    spread = spread_loosely(problem, stated)
     tried = list[BoolArray]()
     for agree_m in (AGREE_M, CLOSER * AGREE_M):
         for start, agree in _overlays(problem.prior, alone, agree_m):
@@ -47,24 +47,15 @@ def start_by_consensus(
             tried.append(agree)
             held = replace(problem, prior=replace(problem.prior, weight=np.where(agree, 1.0, LEAST_WEIGHT)))
             found = converge(held, start, alone.noise, heavy_rounds=1)
-            cost = cost_in_map(found, stated, alone.noise)
+            cost = cost_in_map(found, spread, alone.noise)
             if best is None or cost < best[1]:
                 best = found, cost
     return best
 
 
-def cost_in_map(optimum: SpatialOptimum, stated: FloatArray, noise: SpatialNoise) -> float:
-    """Return the negative log posterior with places of the map that stand or moved, up to a constant.
-
-    Args:
-        optimum: values.
-        stated: (K, 6) standard deviations of the map's places.
-        noise: levels, the same for all that are compared.
-    """
-    problem = optimum.smoother.problem
-    nothing = replace(problem, prior=replace(problem.prior, weight=np.zeros(len(problem.prior.place))))
-    cost = SpatialSmoother(nothing, optimum.estimate.pose).linearised(optimum.estimate, noise, heavy=False).cost
-    return cost - log_density_in_map(problem, optimum.estimate.place, stated)
+def spread_loosely(problem: SpatialProblem, stated: FloatArray) -> FloatArray:
+    """Return covariances (K, 6, 6) of places of a map before it is known which of them stand, as of `cost_in_map`."""
+    return square(np.maximum(stated, problem.settings.map.loose_m))
 
 
 def _overlays(prior: PlacePrior, alone: SpatialOptimum, agree_m: float) -> list[tuple[SpatialEstimate, BoolArray]]:

@@ -23,7 +23,7 @@ from evermap.geometry.rigid import rigid
 from evermap.geometry.symmetry import Symmetries
 from evermap.geometry.upright import is_level
 from evermap.slam.calibration import price
-from evermap.slam.space.against_map import MapComparison, has_contradictions
+from evermap.slam.space.against_map import MapComparison, cost_in_map, has_contradictions
 from evermap.slam.space.bodies import BodyMove, has_left, join_rests, mistrust_bodies, number_moved
 from evermap.slam.space.delays import Delays, with_delays
 from evermap.slam.space.drift import Drift, drift_of
@@ -39,7 +39,7 @@ from evermap.slam.space.estimate import (
 from evermap.slam.space.explanation import explain_places
 from evermap.slam.space.intake import SpatialIntake, start_noise
 from evermap.slam.space.linearise import CORNERS, POINT, STATES
-from evermap.slam.space.map_consensus import cost_in_map, start_by_consensus
+from evermap.slam.space.map_consensus import spread_loosely, start_by_consensus
 from evermap.slam.space.marginal import log_marginal_likelihood
 from evermap.slam.space.moved_within import MovedWithin, find_superseded, list_movers
 from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
@@ -442,7 +442,7 @@ def _or_by_consensus(optimum: SpatialOptimum, stated: FloatArray) -> SpatialOpti
     alone = converge(free, estimate, noise)
     found = start_by_consensus(problem, alone, stated)
     gain_nats = problem.settings.repair.gain_nats
-    if found is None or found[1] > cost_in_map(optimum, stated, alone.noise) - gain_nats:
+    if found is None or found[1] > cost_in_map(optimum, spread_loosely(problem, stated), alone.noise) - gain_nats:
         return optimum
     return found[0]
 
