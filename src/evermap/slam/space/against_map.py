@@ -18,11 +18,11 @@ from evermap.geometry import se2, se3
 from evermap.slam.changes.evidence import WindowEvidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import PLACES, POINTS
-from evermap.slam.space.estimate import SpatialOptimum, converge, with_worth
-from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialNoise, SpatialProblem
+from evermap.slam.space.estimate import SpatialOptimum, as_seen, converge, with_worth
+from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.range_errors import consider_range_errors, find_range_errors, shows_errors
 from evermap.slam.space.smoother import SpatialSmoother
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 12
 FARTHEST = 0.25
@@ -36,6 +36,8 @@ FACTORS, ALIKE = (1.0, 1.4, 2.0), (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 LOOSE = 1.0 / 20.0**2
 """Information of a session by itself in directions of which it says nothing [1/m^2, 1/rad^2]."""
 LOG_2PI = math.log(2.0 * math.pi)
+FEWEST = 3.0
+"""Sightings from which a place may hold frames that nothing else ties."""
 LEAST_INFORMATION = 1.0 / 25.0
 """Of a place by the others alone: it is somewhere within 5 m, or 5 rad."""
 
@@ -107,11 +109,48 @@ def compared(
         stated: (K, 6) standard deviations of the map's places.
         groups: places that are known to have moved.
     """
-    problem, shared, begun = (
-        optimum.smoother.problem,
-        measure_shared_errors(optimum, optimum.smoother.problem.prior.place),
-        optimum.noise,
-    )
+    shared = measure_shared_errors(optimum, optimum.smoother.problem.prior.place)
+    optimum, found = _or_without_rare(optimum, stated, shared, groups)
+    for group in groups:
+        found.p_stands[group.members] = 1.0 - group.probability
+    return optimum, replace(found, groups=groups)
+
+
+def _or_without_rare(
+    begun: SpatialOptimum, stated: FloatArray, shared: FloatArray, groups: tuple[MovedTogether, ...]
+) -> tuple[SpatialOptimum, MapComparison]:
+    """Return the optimum as of `_settle_places`, or a better one that begins without places that were hardly seen; and
+    probabilities over both.
+
+    Where nothing ties frames but what they see, a place that was seen once may hold those by which others stand.
+    """
+    best = _settle_places(begun, stated, shared, groups)
+    problem, found = best[0].smoother.problem, best[1]
+    hits = np.bincount(problem.place, best[0].now.weight, minlength=len(problem.oriented))[problem.prior.place]
+    rare = (hits > 0.0) & (hits < FEWEST) & (found.p_stands >= 0.5)
+    if problem.driven or not rare.any() or (found.p_stands >= 0.5).all():
+        return best
+    without, _ = _settle_places(begun, stated, shared, groups, hold=~rare)
+    other = _settle_places(without, stated, shared, groups)
+    spread = square(np.maximum(stated, problem.settings.map.loose_m))
+    costs = np.array([cost_in_map(one, spread, begun.noise) for one, _ in (best, other)])
+    share = np.exp(costs.min() - costs)
+    share /= share.sum()
+    optimum, found = (best, other)[int(np.argmin(costs))]
+    return optimum, replace(found, p_stands=share @ np.array([best[1].p_stands, other[1].p_stands]))
+
+
+def _settle_places(
+    optimum: SpatialOptimum,
+    stated: FloatArray,
+    shared: FloatArray,
+    groups: tuple[MovedTogether, ...],
+    hold: BoolArray | None = None,
+) -> tuple[SpatialOptimum, MapComparison]:
+    """Return the optimum with every place of the map weighted by the probability that it stands, and these: in turns,
+    each by the others. `hold` (K,) are those that may hold poses; all where None.
+    """
+    problem, begun = optimum.smoother.problem, optimum.noise
 
     def judge(found: MapComparison, accuracy: Accuracy) -> MapComparison:
         found = _judge_places(problem, found, accuracy.factor * stated, accuracy.alike**2 * shared)
@@ -130,10 +169,14 @@ def compared(
         if shared.any():  # else the factor follows from what stands, and settles with it
             found = judge(found, accuracy)
         weight = _weigh_places(found, sigma, problem.prior.weight)
+        if hold is not None:
+            weight[~hold] = LEAST_WEIGHT
         back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
+        ignored = _find_ignored(optimum) & (weight >= 0.5)
+        weight[ignored] = LEAST_WEIGHT
         problem = replace(problem, prior=replace(problem.prior, sigma=sigma, weight=weight))
-        optimum = converge(problem, optimum.estimate, begun, heavy_rounds=int(back))
+        optimum = converge(problem, _place_as_seen(optimum, ignored), begun, heavy_rounds=int(back))
         error = find_range_errors(optimum)
         held |= bool(np.any(np.abs(error - problem.range_error) > SETTLED_ERROR))
         problem = problem.with_range_error(error)
@@ -145,10 +188,31 @@ def compared(
         decided = is_held and np.array_equal(found.p_stands < 0.5, before.p_stands < 0.5)
         if not held and (decided or np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED):
             break
-    optimum, found = best  # each place is judged by the others as they are: a few that are wrong may drive out many
-    for group in groups:
-        found.p_stands[group.members] = 1.0 - group.probability
-    return optimum, replace(found, groups=groups)
+    return best  # each place is judged by the others as they are: a few that are wrong may drive out many
+
+
+def _find_ignored(optimum: SpatialOptimum) -> BoolArray:
+    """Return which places of the map (K,) are not where most of their detections see them: these are outliers there, so
+    that the session seems to say nothing of the place.
+    """
+    problem, place = optimum.smoother.problem, optimum.smoother.problem.prior.place
+    count = np.bincount(problem.place, minlength=len(problem.oriented))[place]
+    used = np.bincount(problem.place, optimum.now.weight, minlength=len(problem.oriented))[place]
+    return np.asarray((count >= FEWEST) & (used < 0.5 * count))
+
+
+def _place_as_seen(optimum: SpatialOptimum, some: BoolArray) -> SpatialEstimate:
+    """Return the values with places of the map, `some` (K,), in the middle of where their detections see them."""
+    problem, estimate = optimum.smoother.problem, optimum.estimate
+    if not some.any():
+        return estimate
+    seen, place = as_seen(problem, estimate, problem.measured), estimate.place.copy()
+    for row in problem.prior.place[some].tolist():
+        mine = seen[problem.place == row]
+        middle = np.median(mine[:, :3], axis=0)
+        place[row] = mine[int(np.argmin(np.linalg.norm(mine[:, :3] - middle, axis=1)))]
+        place[row, 3:] = place[row, 3:] if problem.oriented[row] else estimate.place[row, 3:]
+    return replace(estimate, place=place)
 
 
 def has_contradictions(optimum: SpatialOptimum) -> bool:
