@@ -10,9 +10,10 @@ landmarks after that alignment.
     python -m benchmarks.starloc [shared/data/starloc]
 
 With `--sweep` the survey is edited in ways of which the truth is known: entries moved (`moved`: shares and distances of
-EDITS), a part of them at each other's places (`rearranged`), or all of them (`another`: nothing may be told of single
-entries). Every row is a run by `run_slam`, or with `--audit` by `evermap audit`, with what it says of entries that were
-seen three times or more, and gtsam's error with the same survey. Design and held-out sessions and seeds are apart.
+EDITS), a part of them at each other's places (`rearranged`), about half (`half`), or all (`another`: nothing may be
+told of single entries). Every row is a run by `run_slam`, or with `--audit` by `evermap audit`, with what it says of
+entries that were seen three times or more, and gtsam's error with the same survey. Design and held-out sessions and
+seeds are apart.
 
     python -m benchmarks.starloc --sweep [--held-out] [--audit] [--only SESSION..] [--kinds KIND..]
 
@@ -212,7 +213,7 @@ class Edit:
     """A way in which a survey is wrong.
 
     Attributes:
-        kind: `published` as it is, `moved`, `rearranged` or `another`.
+        kind: `published` as it is, `moved`, `rearranged`, `half` or `another`.
         seed: of it; those of held-out edits differ.
         share: of the entries.
         from_m, to_m: distances, as likely in each octave.
@@ -232,7 +233,7 @@ class Edit:
             by = random.normal(size=(len(some), 3))
             by /= np.linalg.norm(by, axis=1, keepdims=True)
             position[some] += by * np.exp(random.uniform(np.log(self.from_m), np.log(self.to_m), (len(some), 1)))
-        elif self.kind in ("rearranged", "another"):
+        elif self.kind != "published":  # each at the next one's place
             position[some] = position[np.roll(some, 1)]
         return replace(survey, position_m=position)
 
@@ -242,6 +243,8 @@ DESIGNED = ("eight_s2", "loop-2d_s1", "loop-2d-fast_s2", "loop-3d_s2")
 LARGE_M = 0.3
 """From which a move is large beside what such a camera sees."""
 FEWEST = 3
+HALF = (0.5, 0.6)
+"""Shares of the entries that are at each other's places in a map of which about half is wrong."""
 
 
 def edits(*, held_out: bool) -> list[Edit]:
@@ -255,6 +258,7 @@ def edits(*, held_out: bool) -> list[Edit]:
         Edit("moved", first + 6, 0.3, LARGE_M),
         Edit("rearranged", first + 3, 0.3),
         Edit("another", first + 5, 1.0),
+        *(Edit("half", first + 20 + k, share) for k, share in enumerate(HALF)),
     ]
 
 

@@ -327,8 +327,10 @@ def test_errors_that_last_move_nothing_that_is_seen_twice(by_m, seed):
     others = world.tags[np.delete(np.arange(12), 5)]  # hold the poses
     solved = solve_space(prepare_space(recording, Config().slam.space), others.as_prior(0.01)).optimum
     each = SpatialOptimum(solved.estimate, solved.noise, *solved.last)  # as the search sees it: detections count as one
-    p_moved = find_p_apart(each, moved_within.MovedWithin(5, 12, 20.0, (19.0, 21.0), 1.0))
+    move = moved_within.MovedWithin(5, 12, 20.0, (19.0, 21.0), 1.0)
+    p_moved = find_p_apart(each, move)
     assert p_moved > 0.99 if by_m > 0.0 else p_moved < 0.1
+    assert find_p_apart(each, move, alike=10.0) < 0.1  # errors of a metre that all sightings of a place share
 
 
 def err_for_a_while(recording: SpatialRecording, persist_s: float, sigma_m: float) -> SpatialRecording:
