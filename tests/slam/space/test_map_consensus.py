@@ -10,7 +10,7 @@ import pytest
 from evermap import run_slam
 from evermap.config import Config
 from evermap.slam.space import against_map
-from evermap.slam.space.against_map import compared
+from evermap.slam.space.against_map import MapComparison, compared
 from evermap.slam.space.estimate import SpatialOptimum, converge
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.problem import SpatialProblem
@@ -146,6 +146,23 @@ def test_turns_that_explain_detections_and_map_worse_are_not_taken(monkeypatch):
     found, from_map = compared(held, stated)
     assert found.estimate is held.estimate
     assert from_map.p_stands.min() > 0.9
+
+
+@pytest.mark.parametrize(("again", "is_taken"), [((5, 6), False), ((6,), True)])
+def test_a_start_without_what_was_hardly_seen_is_taken_where_another_place_comes_back(monkeypatch, again, is_taken):
+    """Solutions that are alike, and which places have moved in them: 5 by the first one, others by the second."""
+    _, worse, stated = solve_held((0.0, 0.0, 4.0))
+    better, from_map = compared(worse, stated)
+
+    def settle(optimum: SpatialOptimum, moved: tuple[int, ...]) -> tuple[SpatialOptimum, MapComparison]:
+        return optimum, replace(from_map, p_stands=np.where(np.isin(np.arange(12), moved), 0.0, 0.97))
+
+    monkeypatch.setattr(against_map, "FEWEST", 30.0)  # all are rare
+    made = iter([settle(worse, (5,)), settle(better, again), settle(better, again)])
+    monkeypatch.setattr(against_map, "_settle_places", lambda *_, **__: next(made))
+    found, told = compared(worse, stated)
+    assert (found is better) == is_taken
+    assert (told.p_stands[5] > 0.9) == is_taken
 
 
 def test_what_was_seen_once_does_not_hold_what_others_stand_by():

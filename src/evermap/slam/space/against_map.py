@@ -132,6 +132,8 @@ def _or_without_rare(
         return best
     without, _ = _settle_places(begun, stated, shared, groups, hold=~rare)
     other = _settle_places(without, stated, shared, groups)
+    if not ((found.p_stands < 0.5) & (other[1].p_stands >= 0.5)).any():  # they drove out none
+        return best
     spread = square(np.maximum(stated, problem.settings.map.loose_m))
     costs = np.array([cost_in_map(one, spread, begun.noise) for one, _ in (best, other)])
     share = np.exp(costs.min() - costs)
