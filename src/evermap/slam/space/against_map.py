@@ -185,17 +185,18 @@ def _settle_places(
         before, found = found, judge(_predict_places(optimum), accuracy)
         spread = square(sigma) + accuracy.alike**2 * shared
         now, was = (cost_in_map(one, spread, begun) for one in (optimum, best[0]))
+        # places are judged by each other as they are: a few that are wrong may drive out many that are right
         if now < was + problem.settings.repair.gain_nats:
             best = optimum, found
         decided = is_held and np.array_equal(found.p_stands < 0.5, before.p_stands < 0.5)
         if not held and (decided or np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED):
             break
-    return best  # each place is judged by the others as they are: a few that are wrong may drive out many
+    return best
 
 
 def _find_ignored(optimum: SpatialOptimum) -> BoolArray:
-    """Return which places of the map (K,) are not where most of their detections see them: these are outliers there, so
-    that the session seems to say nothing of the place.
+    """Return which places of the map (K,) are not where most of their detections see them: these are outliers there,
+    and give no evidence on the place.
     """
     problem, place = optimum.smoother.problem, optimum.smoother.problem.prior.place
     count = np.bincount(problem.place, minlength=len(problem.oriented))[place]
@@ -212,8 +213,8 @@ def _place_as_seen(optimum: SpatialOptimum, some: BoolArray) -> SpatialEstimate:
     for row in problem.prior.place[some].tolist():
         mine = seen[problem.place == row]
         middle = np.median(mine[:, :3], axis=0)
-        place[row] = mine[int(np.argmin(np.linalg.norm(mine[:, :3] - middle, axis=1)))]
-        place[row, 3:] = place[row, 3:] if problem.oriented[row] else estimate.place[row, 3:]
+        numbers = slice(None) if problem.oriented[row] else slice(3)
+        place[row, numbers] = mine[int(np.argmin(np.linalg.norm(mine[:, :3] - middle, axis=1))), numbers]
     return replace(estimate, place=place)
 
 
