@@ -130,9 +130,11 @@ def _or_without_rare(
     rare = (hits > 0.0) & (hits < FEWEST) & (found.p_stands >= 0.5)
     if problem.driven or not rare.any() or (found.p_stands >= 0.5).all():
         return best
-    without, _ = _settle_places(begun, stated, shared, groups, hold=~rare)
-    other = _settle_places(without, stated, shared, groups)
-    if not ((found.p_stands < 0.5) & (other[1].p_stands >= 0.5)).any():  # they drove out none
+    gone = found.p_stands < 0.5
+    other = _settle_places(begun, stated, shared, groups, hold=~rare)
+    if (other[1].p_stands[gone] >= 0.5).any():  # which they drove out
+        other = _settle_places(other[0], stated, shared, groups)
+    if not (other[1].p_stands[gone] >= 0.5).any():
         return best
     spread = square(np.maximum(stated, problem.settings.map.loose_m))
     costs = np.array([cost_in_map(one, spread, begun.noise) for one, _ in (best, other)])
