@@ -214,8 +214,8 @@ def test_a_map_of_which_most_is_elsewhere_is_in_doubt_not_its_landmarks(n_off: i
     p_stands = np.where(np.arange(10) < n_off, 0.49, 0.51)
     found = MapComparison(p_stands, np.zeros((10, 6)), np.zeros((10, 6, 6)), AS_STATED)
     unused: Any = None
-    assert _contradicts_map(SpatialExplanation(unused, np.arange(10), (), found)) is is_in_doubt
-    assert not _contradicts_map(SpatialExplanation(unused, np.arange(10), (), None))
+    assert _contradicts_map(SpatialExplanation(unused, np.arange(10), (), found, unused)) is is_in_doubt
+    assert not _contradicts_map(SpatialExplanation(unused, np.arange(10), (), None, unused))
 
 
 def test_others_are_asked_where_none_of_the_likeliest_is_at_two_places(monkeypatch):

@@ -110,38 +110,50 @@ def compared(
         groups: places that are known to have moved.
     """
     shared = measure_shared_errors(optimum, optimum.smoother.problem.prior.place)
-    optimum, found = _or_without_rare(optimum, stated, shared, groups)
-    for group in groups:
-        found.p_stands[group.members] = 1.0 - group.probability
-    return optimum, replace(found, groups=groups)
+    optimum, found = _settle_places(optimum, stated, shared, groups)
+    return optimum, _with_groups(found, groups)
 
 
-def _or_without_rare(
-    begun: SpatialOptimum, stated: FloatArray, shared: FloatArray, groups: tuple[MovedTogether, ...]
+def compared_without_rare(
+    begun: SpatialOptimum, best: tuple[SpatialOptimum, MapComparison], stated: FloatArray
 ) -> tuple[SpatialOptimum, MapComparison]:
-    """Return the optimum as of `_settle_places`, or a better one that begins without places that were hardly seen; and
+    """Return what `compared` found, or what is better and begins without places that were hardly seen; and
     probabilities over both.
 
     Where nothing ties frames but what they see, a place that was seen once may hold those by which others stand.
+
+    Args:
+        begun: the optimum that was compared.
+        best: what `compared` found.
+        stated: (K, 6) standard deviations of the map's places.
     """
-    best = _settle_places(begun, stated, shared, groups)
     problem, found = best[0].smoother.problem, best[1]
     hits = np.bincount(problem.place, best[0].now.weight, minlength=len(problem.oriented))[problem.prior.place]
     rare = (hits > 0.0) & (hits < FEWEST) & (found.p_stands >= 0.5)
     if problem.driven or not rare.any() or (found.p_stands >= 0.5).all():
         return best
     gone = found.p_stands < 0.5
-    other = _settle_places(begun, stated, shared, groups, hold=~rare)
+    shared = measure_shared_errors(begun, begun.smoother.problem.prior.place)
+    other = _settle_places(begun, stated, shared, found.groups, hold=~rare)
     if (other[1].p_stands[gone] >= 0.5).any():  # which they drove out
-        other = _settle_places(other[0], stated, shared, groups)
+        other = _settle_places(other[0], stated, shared, found.groups)
     if not (other[1].p_stands[gone] >= 0.5).any():
         return best
     spread = square(np.maximum(stated, problem.settings.map.loose_m))
     costs = np.array([cost_in_map(one, spread, begun.noise) for one, _ in (best, other)])
     share = np.exp(costs.min() - costs)
     share /= share.sum()
-    optimum, found = (best, other)[int(np.argmin(costs))]
-    return optimum, replace(found, p_stands=share @ np.array([best[1].p_stands, other[1].p_stands]))
+    optimum, taken = (best, other)[int(np.argmin(costs))]
+    p_stands = share @ np.array([found.p_stands, other[1].p_stands])
+    return optimum, _with_groups(replace(taken, p_stands=p_stands), found.groups)
+
+
+def _with_groups(found: MapComparison, groups: tuple[MovedTogether, ...]) -> MapComparison:
+    """Return the comparison with places that are known to have moved."""
+    p_stands = found.p_stands.copy()
+    for group in groups:
+        p_stands[group.members] = 1.0 - group.probability
+    return replace(found, p_stands=p_stands, groups=groups)
 
 
 def _settle_places(

@@ -18,6 +18,7 @@ from evermap.slam.space.against_map import (
     MapComparison,
     MovedTogether,
     compared,
+    compared_without_rare,
     find_p_stands,
     log_map_density,
     measure_shared_errors,
@@ -47,12 +48,14 @@ class SpatialExplanation:
         identity: (P,) rows of landmarks that the places are of.
         moves: landmarks that moved during the session.
         from_map: what of the given map stands; None without a map.
+        begun: the solution before places of the map were compared.
     """
 
     optimum: SpatialOptimum
     identity: IntArray
     moves: tuple[MovedWithin, ...]
     from_map: MapComparison | None
+    begun: SpatialOptimum
 
 
 def explain_places(
@@ -106,8 +109,13 @@ def explain_places(
         if is_told
     )
     if all(told):
-        return replace(found, moves=moves)
-    return _explain_with(found.optimum, found.identity, moves, whole, stated, changes, of_bodies)
+        found = replace(found, moves=moves)
+    else:
+        found = _explain_with(found.optimum, found.identity, moves, whole, stated, changes, of_bodies)
+    if found.from_map is None:
+        return found
+    optimum, from_map = compared_without_rare(found.begun, (found.optimum, found.from_map), stated)
+    return replace(found, optimum=optimum, from_map=from_map)
 
 
 def find_p_apart(optimum: SpatialOptimum, move: MovedWithin, alike: float = 0.0) -> float:
@@ -160,12 +168,12 @@ def _explain_with(
     if (together := rejoined(optimum, identity, apart)) is not None:
         optimum = converge(*together, optimum.noise, heavy_rounds=0)
     if not len(stated):
-        return SpatialExplanation(optimum, identity, moves, None)
+        return SpatialExplanation(optimum, identity, moves, None, optimum)
     groups: tuple[MovedTogether, ...] = ()
     if changes is not None:
         optimum, groups = find_moved_groups(optimum, stated, changes)
-    optimum, from_map = compared(optimum, stated, groups)
-    return SpatialExplanation(optimum, identity, moves, from_map)
+    compared_optimum, from_map = compared(optimum, stated, groups)
+    return SpatialExplanation(compared_optimum, identity, moves, from_map, optimum)
 
 
 def _log_evidence(explanation: SpatialExplanation, begun: SpatialNoise, lasting: Lasting) -> float:
