@@ -148,6 +148,26 @@ def test_turns_that_explain_detections_and_map_worse_are_not_taken(monkeypatch):
     assert from_map.p_stands.min() > 0.9
 
 
+def test_what_was_let_go_does_not_seem_to_stand(monkeypatch):
+    """Of a map in another scale all is let go at once; without it all is so uncertain that it may as well stand."""
+    _, held, stated = solve_held((0.0, 0.0, 0.0))
+
+    def is_held(problem: SpatialProblem) -> bool:
+        return bool((problem.prior.weight >= 0.5).any())
+
+    def judge(problem: SpatialProblem, found: MapComparison, *_: FloatArray) -> MapComparison:
+        return replace(found, p_stands=np.full(len(found.off), 0.0 if is_held(problem) else 0.9))
+
+    def cost(optimum: SpatialOptimum, *_: object) -> float:
+        return 100.0 if is_held(optimum.smoother.problem) else 0.0
+
+    monkeypatch.setattr(against_map, "_judge_places", judge)
+    monkeypatch.setattr(against_map, "cost_in_map", cost)
+    found, from_map = compared(held, stated)
+    assert is_held(found.smoother.problem)
+    assert not ((from_map.p_stands >= 0.5) & (found.smoother.problem.prior.weight < 0.5)).any()
+
+
 @pytest.mark.parametrize(("again", "is_taken"), [((5, 6), False), ((6,), True)])
 def test_a_start_without_what_was_hardly_seen_is_taken_where_another_place_comes_back(monkeypatch, again, is_taken):
     """Solutions that are alike, and which places have moved in them: 5 by the first one, others by the second."""

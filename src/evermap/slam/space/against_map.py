@@ -199,8 +199,12 @@ def _settle_places(
         before, found = found, judge(_predict_places(optimum), accuracy)
         spread = square(sigma) + accuracy.alike**2 * shared
         now, was = (cost_in_map(one, spread, begun) for one in (optimum, best[0]))
-        # places are judged by each other as they are: a few that are wrong may drive out many that are right
-        if now < was + problem.settings.repair.gain_nats:
+        # places are judged by each other as they are: a few that are wrong may drive out many that are right; and of
+        # places that are let go all is so uncertain that they seem to stand
+        is_held_by_all = not np.any(
+            (found.p_stands >= 0.5) & (weight < 0.5) & ~ignored & (True if hold is None else hold)
+        )
+        if is_held_by_all and now < was + problem.settings.repair.gain_nats:
             best = optimum, found
         decided = is_held and np.array_equal(found.p_stands < 0.5, before.p_stands < 0.5)
         if not held and (decided or np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED):
