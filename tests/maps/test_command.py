@@ -229,7 +229,7 @@ def test_export_reads_back_as_the_map(site: Path, tmp_path: Path, ending: str) -
     assert read.landmark_id.tolist() == wanted.landmark_id.tolist()
     for name in ("position_m", "covariance_m2", "p_exists", "last_seen_s"):
         np.testing.assert_array_equal(getattr(read, name), getattr(wanted, name))
-    assert said("export", site, "--out", out, "--p-least", 0.0)["landmarks"] == len(MAPS[2].landmarks())
+    assert said("export", site, "--out", out, "--p-least", 0.0, "--force")["landmarks"] == len(MAPS[2].landmarks())
     if ending == "csv":
         with out.open() as stream:
             assert set(next(csv.DictReader(stream))["class_id"]) <= set("palletcart")

@@ -11,7 +11,6 @@ import typer
 
 from evermap.cli.options import ConfigFile, Force, Settings, argument, configure, default_out, option
 from evermap.cli.terminal import command_line, echo, print_json, print_table, progress_bar, say, warm_up, warn
-from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.types import AnyRecording, Progress
@@ -87,9 +86,7 @@ def audit(
     folder = out or default_out(f"audit-{map_file.name}")
     check_replaceable(folder, force=force, inputs=inputs)
     if write is not None:
-        check_output_file(write, inputs=inputs)
-        if write.exists() and not force:
-            raise ConfigError(f"{write} is there already", field="write", hint="another name, or --force")
+        check_output_file(write, inputs=inputs, force=force)
     file = read_map_file(map_file, sigma_m=prior_sigma or 0.02)
     drives = [read_recording(path) for path in input]
     in_space = any(map(is_in_space, drives))

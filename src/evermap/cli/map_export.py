@@ -93,6 +93,7 @@ def export(
     p_least: _PLeast = 0.5,
     up: _UpDirection = None,
     as_json: ResultAsJson = False,
+    force: Annotated[bool, option("--force", "Replace files that are there.")] = False,
 ) -> None:
     """Write existing landmarks, or learned lifetimes, to a file.
 
@@ -116,7 +117,7 @@ def export(
             write_map(landmarks, out, kind)
             return {"format": kind.name}
 
-    _write_files(file, out, write, lifetimes, revision=revision, p_least=p_least, up=up, as_json=as_json)
+    _write_files(file, out, write, lifetimes, revision=revision, p_least=p_least, up=up, as_json=as_json, force=force)
 
 
 def nav2(
@@ -164,17 +165,22 @@ def _write_files(
     up: str | None,
     as_json: bool,
     inputs: Sequence[Path | None] = (),
+    force: bool = False,
 ) -> None:
     """Write landmarks by their writer, and lifetimes; and say so."""
-    from evermap.existence.models import save_lifetimes
+    from evermap.existence.models import is_model_file, save_lifetimes
     from evermap.io.landmarks import up_dict
     from evermap.maps.learning import lifetimes_by_class
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
 
-    for path in (out, lifetimes):
-        if path is not None:
-            check_output_file(path, inputs=[file, *inputs], ending=".json" if path is lifetimes else "")
+    read = [file, *inputs]
+    if out is not None:
+        check_output_file(out, inputs=read, force=force)
+        if out.suffix == ".yaml" and write is not None:
+            check_output_file(out.with_suffix(".pgm"), inputs=read, force=force)
+    if lifetimes is not None:
+        check_output_file(lifetimes, inputs=read, ending=".json", force=force, ours=is_model_file)
     with open_store(file) as store:
         number = store.head() if revision is None else revision
         living = store.load(number)

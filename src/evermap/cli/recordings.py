@@ -185,9 +185,7 @@ def check_session(path: Path, *, force: bool, inputs: Sequence[str | Path | None
     """
     from evermap.runs.folder import check_output_file
 
-    check_output_file(path, inputs=inputs)
-    if path.exists() and not force:
-        raise ConfigError(f"{path} is there already", field="offline_session", hint="another name, or --force")
+    check_output_file(path, inputs=inputs, force=force)
 
 
 def write_condensed(recording: AnyRecording, path: Path) -> None:

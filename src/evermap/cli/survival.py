@@ -146,6 +146,7 @@ def fit(
     """Estimate lifetime distributions from censored lifetimes."""
     given = {"by": by, "estimator": estimator, "chunk_m": chunk_m}
     chosen = configure(config, settings, given, within="survival", show=show_config).survival
+    from evermap.existence.models import is_model_file
     from evermap.runs.folder import check_output_file
     from evermap.runs.track.lifetimes import BY_CHUNK, check_estimator, estimates, groups_of, parse_by, read_lifetimes
 
@@ -154,7 +155,7 @@ def fit(
     if figure is not None:
         check_picture(figure, "figure", inputs=[input])
     if out is not None:
-        check_output_file(out, inputs=[input], ending=".json")
+        check_output_file(out, inputs=[input], ending=".json", ours=is_model_file)
     if out is not None and BY_CHUNK in words:
         raise ConfigError("a model file has no places", field="out", hint="--by class, or the texts of --json")
     table = read_lifetimes(input)
@@ -223,11 +224,12 @@ def learn(
         chosen = chosen.model_copy(update={"recurrent": "auto"})
     if figure is not None:
         check_picture(figure, "figure", inputs=[input])
+    from evermap.existence.models import is_model_file
     from evermap.runs.folder import check_output_file
     from evermap.runs.persist.models import learn_models, save_models
     from evermap.runs.persist.table import read_looks
 
-    check_output_file(out, inputs=[input], ending=".json")
+    check_output_file(out, inputs=[input], ending=".json", ours=is_model_file)
     table = read_looks(input, p_miss=chosen.p_miss, p_false=chosen.p_false)
     with progress_bar(f"{input.name}: learning", speed=False) as progress:
         tell = None if progress is None else lambda done: progress(done, 1.0)

@@ -32,6 +32,7 @@ def view(
         ),
     ] = None,
     as_json: AsJson = False,
+    force: Annotated[bool, option("--force", "Replace a file that is there.")] = False,
 ) -> None:
     """Look at a map, a run or a live drive in the rerun viewer.
 
@@ -46,12 +47,12 @@ def view(
       evermap view tcp/localhost:7447
     """
     if re.match(r"(tcp|udp|tls|quic|ws)/|listen=", path) and not Path(path).exists():
-        _look_on(path, save)
+        _look_on(path, save, force=force)
     else:
-        _look_at(Path(path), save, as_json=as_json)
+        _look_at(Path(path), save, as_json=as_json, force=force)
 
 
-def _look_on(where: str, save: Path | None) -> None:
+def _look_on(where: str, save: Path | None, *, force: bool) -> None:
     """Show a drive until it is stopped."""
     from evermap.live.ros import look_on
     from evermap.live.wires import Mailbox, Zenoh
@@ -63,7 +64,7 @@ def _look_on(where: str, save: Path | None) -> None:
     elif save.suffix != ".rrd":
         raise ConfigError(f"cannot write a '{save.suffix}' file", path=save, field="save", hint="drive.rrd")
     else:
-        check_output_file(save, ending=".rrd")
+        check_output_file(save, ending=".rrd", force=force)
     mailbox = Mailbox(ours=True)
     zenoh, scene = Zenoh(where, mailbox), LiveScene(save)
     say("showing the drive of evermap live; Ctrl-C ends it")
@@ -81,7 +82,7 @@ def _need_screen() -> None:
         raise ConfigError("there is no screen to open a viewer on", field="view", hint="--save scene.rrd")
 
 
-def _look_at(path: Path, save: Path | None, *, as_json: bool) -> None:
+def _look_at(path: Path, save: Path | None, *, as_json: bool, force: bool) -> None:
     """Open the written file in the viewer."""
     from evermap.runs.folder import check_output_file
     from evermap.runs.view import write_view
@@ -89,7 +90,7 @@ def _look_at(path: Path, save: Path | None, *, as_json: bool) -> None:
     if not path.exists():
         raise InputError("no such map or run", path=path, hint="check the path")
     if save is not None:
-        check_output_file(save, inputs=[path], ending=save.suffix)
+        check_output_file(save, inputs=[path], ending=save.suffix, force=force)
         remarks = write_view(path, save)
         for remark in remarks:
             warn(remark)

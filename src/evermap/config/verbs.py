@@ -23,7 +23,7 @@ class LiveConfig(Section):
 
     reorder_s: NotNegative = key(0.1, "maximum delay of a reading behind the newest one, by their stamps [s]")
     checkpoint_s: Positive = key(
-        5.0, "interval at which readings are written to the disk: a crash loses so much, and some tenths more [s]"
+        2.0, "interval at which readings are written to the disk: a crash loses so much, and some tenths more [s]"
     )
     revision_s: NotNegative = key(
         300.0, "interval at which the drive enters the map as a revision; 0: only at the end [s]"

@@ -174,6 +174,15 @@ def save_models(models: NamedModels, path: str | Path) -> Path:
     return write_atomic(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+def is_model_file(path: str | Path) -> bool:
+    """Return whether a file is one of models."""
+    try:
+        load_models(path)
+    except EvermapError:
+        return False
+    return True
+
+
 def load_models(path: str | Path) -> NamedModels:
     """Read what `save_models` wrote: the model under '', or one for every name.
 

@@ -22,6 +22,7 @@ from evermap.errors import InputError
 from evermap.interrupts import temporary
 from evermap.io.text import reason
 from evermap.types import Recording, SpatialRecording
+from evermap.types.mark import MARK
 
 # Errors of `zipfile` on damaged or encrypted archives, found by corrupting them at random.
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
@@ -271,6 +272,15 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror or error}", path=path) from error
     return path
+
+
+def is_marked(path: Path) -> bool:
+    """Return whether evermap wrote a file, by its `MARK`."""
+    try:
+        with path.open("rb") as file:
+            return MARK.encode() in file.read(4096)
+    except OSError:
+        return False
 
 
 def write_new(path: str | Path, content: bytes | str) -> Path:

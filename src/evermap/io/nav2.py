@@ -21,6 +21,7 @@ from evermap.geometry.upright import level_map, level_pose
 from evermap.io.files import content_of, write_atomic
 from evermap.io.text import is_number, parse_json
 from evermap.types import FloatArray, Landmarks
+from evermap.types.mark import MARK
 
 MOST_CELLS = 50_000_000
 MARGIN_M = 1.0
@@ -163,11 +164,11 @@ def _write_image(
     """The image, dark where the value (H, W) is 1, and its YAML."""
     shade = np.rint(255.0 * (1.0 - value[::-1])).astype(np.uint8)  # the first row is the northernmost
     image, (west_m, south_m), (free, occupied) = path.with_suffix(".pgm"), origin_m, thresholds
-    write_atomic(image, f"P5\n{value.shape[1]} {value.shape[0]}\n255\n".encode() + shade.tobytes())
+    write_atomic(image, f"P5\n# {MARK}\n{value.shape[1]} {value.shape[0]}\n255\n".encode() + shade.tobytes())
     return write_atomic(
         path,
-        f"{head}image: {image.name}\nmode: scale\nresolution: {cell_m!r}\norigin: [{west_m!r}, {south_m!r}, 0.0]\n"
-        f"negate: 0\noccupied_thresh: {occupied!r}\nfree_thresh: {free!r}\n",
+        f"{head}# {MARK}\nimage: {image.name}\nmode: scale\nresolution: {cell_m!r}\n"
+        f"origin: [{west_m!r}, {south_m!r}, 0.0]\nnegate: 0\noccupied_thresh: {occupied!r}\nfree_thresh: {free!r}\n",
     )
 
 
@@ -240,7 +241,11 @@ def write_route_graph(
     turned = level_pose(landmarks.up)
     if turned[:6].any():
         about["graph_from_map"] = dict(zip(("qx", "qy", "qz", "qw"), turned[3:].tolist(), strict=True))
-    write_atomic(path, json.dumps({**document, "evermap": about, "features": kept}, indent=1, allow_nan=False) + "\n")
+    write_atomic(
+        path,
+        json.dumps({"generator": MARK, **document, "evermap": about, "features": kept}, indent=1, allow_nan=False)
+        + "\n",
+    )
     return edges
 
 

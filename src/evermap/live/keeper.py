@@ -98,8 +98,9 @@ class Keeper:
         if self._spool is not None:
             return
         self._spool = Spool(self.file)
-        for brought in enter_waiting(self.file):
-            self._told.warnings.append(f"recovered from {brought.name}, whose process ended before it was entered")
+        for brought in enter_waiting(self.file, self._config):
+            if not brought.problem:
+                self._told.warnings.append(f"recovered from {brought.name}, whose process ended before it was entered")
             self._take(brought)
         self._spool.settle(self._config)
 
@@ -169,7 +170,7 @@ class Keeper:
     def enter(self, file: Path) -> Entered | None:
         """Enter sessions that wait, now; returns what the last of them made of the map."""
         entered = None
-        for brought in enter_waiting(file):
+        for brought in enter_waiting(file, self._config):
             self._take(brought)
             entered = brought.entered or entered
         return entered
@@ -206,6 +207,8 @@ class Keeper:
     def _take(self, brought: Brought) -> None:
         if brought.problem:
             self._told.warnings.append(f"{brought.name}: not entered: {brought.problem}")
+        if brought.damage:
+            self._told.warnings.append(f"{brought.name}: {brought.damage}")
 
 
 def _check_fits(living: LivingMap, clock: Clock, dim: int) -> None:

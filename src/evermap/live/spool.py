@@ -1,16 +1,19 @@
 """Readings of a drive on the disk until they have entered the map; they survive a crash.
 
-The folder `MAP.live` holds a file for each session: parts of a recording one after the other, each with its length in
-front, so that a part that a crash cut off is recognised. The one that is being written ends in `.part`. A process that
-feeds a map holds the lock of the folder; its end, whatever it dies of, gives the lock back.
+The folder `MAP.live` holds a file for each session: parts of a recording one after the other (`parts`). The one that is
+being written ends in `.part`. Readings that have not entered the map are never deleted: of a damaged file, what is
+intact enters, and the file is set aside. A process that feeds a map holds the lock of the folder; its end, whatever it
+dies of, gives the lock back.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,14 +23,23 @@ from typing import IO, Any
 from evermap.config import Config, parse_config, to_toml
 from evermap.errors import ConfigError, DataError, EvermapError, InputError, NumericalError
 from evermap.io import write_native
+from evermap.io.files import write_atomic
 from evermap.live.inbox import joined
+from evermap.live.parts import pack_part, unpack_parts
 from evermap.maps.store import StaleRevisionError, open_store
-from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.runs.sessions import Entered, TwiceError, enter_session
 from evermap.types import AnyRecording
 
 TRIES = 3
 """Attempts to enter a session while another process changes the map."""
+WAITING = ".readings"
+"""Ending of the file of a session that waits to be entered."""
+
+
+_NAMED = re.compile(r"(?:aside-|damaged-)?(\d+)(?:\.[a-z]+)?")
+"""What is of a session: waiting, being written, set aside, damaged."""
+_SUM = "# checksum "
+"""Beginning of the first line of settings, before the CRC-32 of the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +48,17 @@ class Brought:
 
     Attributes:
         name: of its recording.
-        revision: of the map that it made; None where it was set aside.
-        problem: why it was; empty where it was not.
+        revision: of the map that it made; None where it made none.
+        problem: why it did not enter; empty where it did, or had.
         entered: what it made of the map; None as above, and where it was in the map already.
+        damage: what of it is lost; empty where nothing is.
     """
 
     name: str
     revision: int | None
     problem: str = ""
     entered: Entered | None = None
+    damage: str = ""
 
 
 class Spool:
@@ -66,32 +80,64 @@ class Spool:
             hint = "one engine feeds a map; others localise in it: mapping=False"
             raise ConfigError("another process feeds this map", path=map_file, hint=hint)
         for part in self.folder.glob("*.part"):
-            part.rename(part.with_suffix(".readings"))
+            self._let_wait(part)
         self._file: IO[bytes] | None = None
-        self._number = 0
+        self._number = self._parts = 0
+        self._unwritten: list[bytes] = []
 
     def settle(self, config: Config) -> None:
         """Keep the settings that sessions are entered with from here on."""
-        (self.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
+        text = to_toml(config)
+        write_atomic(self.folder / "config.toml", f"{_SUM}{zlib.crc32(text.encode()):08x}\n{text}")
+        _sync(self.folder)
 
     def write(self, recording: AnyRecording) -> None:
-        """Put a part of the present session on the disk."""
+        """Put a part of the present session on the disk. One that finds no room there is written with the next.
+
+        Raises:
+            OSError: it cannot be written now.
+        """
         if self._file is None:
-            there = (int(path.stem) for path in self.folder.glob("[0-9]*.readings"))
-            self._number = 1 + max(self._number, *there, 0)
-            self._file = (self.folder / f"{self._number:06d}.part").open("ab")
-        data = pack_recording(recording)
-        self._file.write(len(data).to_bytes(8, "little") + data)
-        self._file.flush()
-        os.fsync(self._file.fileno())
+            self._number = 1 + max(self._number, *_find_numbers(self.folder), 0)
+            self._parts, self._file = 0, (self.folder / f"{self._number:06d}.part").open("ab")
+            _sync(self.folder)
+        self._parts += 1
+        self._unwritten.append(pack_part(self._parts, recording))
+        begin = self._file.tell()
+        try:
+            self._file.write(b"".join(self._unwritten))
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError:
+            with suppress(OSError):  # a part of a part is damage; it is skipped where it stays
+                os.truncate(self._file.name, begin)
+            self._reopen()
+            raise
+        self._unwritten = []
 
     def finish(self) -> None:
         """End the present session: it waits to be entered."""
         if self._file is not None:
             path = Path(self._file.name)
             self._file.close()
-            path.rename(path.with_suffix(".readings"))
+            self._let_wait(path)
             self._file = None
+
+    def _reopen(self) -> None:
+        """Let go of bytes that the file still holds in memory, and would write once more."""
+        assert self._file is not None
+        path = self._file.name
+        with suppress(OSError):
+            self._file.close()
+        self._file = Path(path).open("ab")  # noqa: SIM115  (until `finish`)
+
+    def _let_wait(self, part: Path) -> None:
+        """Take a file for a session that has ended."""
+        path = part.with_suffix(WAITING)
+        if path.exists():
+            path = self.folder / f"{1 + max(_find_numbers(self.folder)):06d}{WAITING}"
+        part.rename(path)
+        _sync(self.folder)
 
     def close(self) -> None:
         """Let others feed the map; what waits can be entered by `recover`."""
@@ -107,19 +153,73 @@ class Spool:
         )
 
 
-def enter_waiting(map_file: Path) -> Iterator[Brought]:
+def enter_waiting(map_file: Path, config: Config | None = None) -> Iterator[Brought]:
     """Enter the waiting sessions of a map, one after the other, and report each.
 
-    One that cannot be entered is set aside as a recording in the native format, beside the others.
+    One that cannot be entered is set aside as a recording in the native format, beside the others; of one that is
+    damaged what is intact enters, and its file is kept as `damaged-NUMBER`. Where the map or the disk is at fault it
+    waits for the next attempt.
+
+    Args:
+        map_file: the map that they are of.
+        config: settings where those of the sessions cannot be read; None: as delivered.
     """
     folder = map_file.with_name(f"{map_file.name}.live")
-    settings = folder / "config.toml"
-    config = parse_config(settings.read_text(encoding="utf-8")) if settings.is_file() else Config()
-    for path in sorted(folder.glob("*.readings")):
-        parts = list(read_parts(path))
-        if parts and sum(len(part.detections) for part in parts):
-            yield _entered(map_file, joined(parts), config, path)
+    settings = find_settings(folder / "config.toml") or config or Config()
+    for path in sorted(folder.glob(f"[0-9]*{WAITING}")):
+        try:
+            brought = _enter_file(map_file, path, settings)
+        except EvermapError as error:  # the next attempt may have what this one lacked
+            brought = Brought(path.stem, None, f"{error.problem}; its readings wait in {path}")
+        except Exception as error:
+            defect = "" if isinstance(error, OSError | MemoryError) else f"a bug in evermap: {type(error).__name__}: "
+            brought = Brought(path.stem, None, f"{defect}{error}; its readings wait in {path}")
+        if brought is not None:
+            yield brought
+
+
+def _enter_file(map_file: Path, path: Path, config: Config) -> Brought | None:
+    """Enter a session and delete its file, or set it aside; None where nothing was in it."""
+    parts = unpack_parts(path.read_bytes())
+    brought = Brought(path.stem, None)
+    if sum(len(part.detections) for part in parts.recordings):
+        brought = _entered(map_file, joined(parts.recordings), config, path)
+    if not parts.lost:
         path.unlink(missing_ok=True)
+        return brought if parts.recordings else None
+    aside = path.with_name(f"damaged-{path.name}")
+    path.rename(aside)
+    _sync(path.parent)
+    return replace(brought, damage=f"{parts.damage}; the file is kept as {aside}")
+
+
+def find_settings(path: Path) -> Config | None:
+    """Return the settings that `Spool.settle` wrote; None where there are none, or they are damaged."""
+    try:
+        first, _, rest = (text := path.read_text(encoding="utf-8")).partition("\n")
+        if first.startswith(_SUM):
+            text = rest
+            if f"{zlib.crc32(text.encode()):08x}" != first.removeprefix(_SUM):
+                return None
+        return parse_config(text)
+    except (OSError, ValueError, EvermapError):
+        return None
+
+
+def _find_numbers(folder: Path) -> list[int]:
+    """Return the numbers of all sessions that the folder has anything of."""
+    named = (_NAMED.fullmatch(path.name) for path in folder.iterdir())
+    return [int(match[1]) for match in named if match is not None]
+
+
+def _sync(folder: Path) -> None:
+    """Put the names of a folder's files on the disk, where the system can do that."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def recover(map_file: str | Path) -> tuple[Brought, ...]:
@@ -140,19 +240,6 @@ def recover(map_file: str | Path) -> tuple[Brought, ...]:
         return tuple(enter_waiting(path))
     finally:
         spool.close()
-
-
-def read_parts(path: Path) -> Iterator[AnyRecording]:
-    """Yield the parts of a session until the end of the file, or to where a crash cut it off."""
-    data = path.read_bytes()
-    at = 0
-    while at + 8 <= len(data):
-        size = int.from_bytes(data[at : at + 8], "little")
-        part = data[at + 8 : at + 8 + size]
-        if len(part) < size:
-            return
-        yield unpack_recording(part)
-        at += 8 + size
 
 
 def _entered(map_file: Path, recording: AnyRecording, config: Config, path: Path) -> Brought:
@@ -179,8 +266,7 @@ def _entered(map_file: Path, recording: AnyRecording, config: Config, path: Path
             problem = f"a bug in evermap: {type(error).__name__}: {error}"
             break
     aside = path.with_name(f"aside-{path.stem}")
-    with suppress(InputError):
-        write_native(replace(recording, source=""), aside)
+    write_native(replace(recording, source=""), aside)
     return Brought(recording.name, None, f"{problem}; its readings are in {aside}")
 
 
@@ -189,7 +275,8 @@ def _main(map_file: str) -> None:
     with suppress(OSError, AttributeError):
         os.nice(10)
     for one in enter_waiting(Path(map_file)):
-        print(json.dumps({"name": one.name, "revision": one.revision, "problem": one.problem}), flush=True)
+        row = {"name": one.name, "revision": one.revision, "problem": one.problem, "damage": one.damage}
+        print(json.dumps(row), flush=True)
 
 
 def _take_lock(file: Any) -> bool:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 from evermap import __version__
 from evermap.errors import ConfigError, MissingExtraError
 from evermap.interrupts import held, kept, temporary
-from evermap.io.files import write_atomic
+from evermap.io.files import is_marked, write_atomic
 from evermap.runs.summary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, changes_text, summary_dict, timing_dict
 from evermap.types import AnyRecording, SlamResult
 
@@ -216,10 +216,22 @@ def check_replaceable(
         raise ConfigError(f"contains '{name}', {what}", path=out, field="out", hint=hint)
 
 
-def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] = (), ending: str = "") -> None:
+def check_output_file(
+    path: str | Path,
+    *,
+    inputs: Iterable[str | Path | None] = (),
+    ending: str = "",
+    force: bool = False,
+    ours: Callable[[Path], bool] = is_marked,
+) -> None:
     """Check that a single file may be written: it is none of the inputs, and no living map.
 
-    An older file of that name is replaced; if an `ending` is given, only one that has it.
+    Args:
+        path: the file.
+        inputs: files and folders that are read.
+        ending: of the files that may be replaced.
+        force: replace an older file of that name, whoever wrote it.
+        ours: whether evermap wrote such a file, which is replaced without `force`, too.
 
     Raises:
         ConfigError: what is wrong with it.
@@ -232,6 +244,8 @@ def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] =
         raise ConfigError(f"exists, and is not a {ending} file", path=path, hint=f"a name ending in {ending}")
     if _is_living_map(path):
         raise ConfigError("is a living map, which is never replaced", path=path, hint="another name")
+    if os.path.lexists(path) and not force and not ours(path):
+        raise ConfigError("is there already, and not by this command", path=path, hint="another name, or --force")
 
 
 def _is_living_map(path: Path) -> bool:

@@ -22,6 +22,7 @@ import numpy as np
 
 from evermap.errors import printable
 from evermap.types import FloatArray
+from evermap.types.mark import MARK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -303,7 +304,7 @@ def save_png(figure: Figure, path: Path | BinaryIO, *, dpi: int = 160) -> None:
     """Write a PNG on white paper; the same figure gives the same bytes."""
     _write_powers(figure)
     with house_style():
-        figure.savefig(path, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+        figure.savefig(path, format="png", dpi=dpi, facecolor="white", metadata={"Software": MARK})
 
 
 def save_svg(figure: Figure, path: Path | BinaryIO) -> None:
@@ -350,7 +351,7 @@ def _svg(figure: Figure) -> str:
         return _DRAWN[figure]
     _write_powers(figure)
     buffer = io.StringIO()
-    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    metadata = {"Date": None, "Creator": MARK, "Format": None, "Type": None}
     with house_style():
         figure.savefig(buffer, format="svg", facecolor=PAPER, metadata=metadata)
     figure.stale = False  # from here on it says whether anybody changes the figure

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -55,6 +56,11 @@ _LATER = (
 )  # fmt: skip
 """What is kept only where there is any: equal recordings have the bytes that they had before there was."""
 _PLAIN = ("name", "source", "class_names", "clock")
+UNREADABLE = (
+    AttributeError, EOFError, EvermapError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError,
+    struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""Errors of damaged archives and tables; an absurd shape finds no memory."""
 
 
 def pack_recording(recording: AnyRecording) -> bytes:
@@ -128,7 +134,7 @@ def unpack_recording(data: bytes) -> AnyRecording:
         symmetries = {name: tuple(texts) for name, texts in values.get("symmetries", {}).items()}
         objects = arrays.get("objects", np.zeros((0, 2), dtype=np.int64))
         return Recording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries, objects=objects)
-    except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
 
 
