@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evermap_score.episodes import FloatArray, IntArray, TextArray
+from evermap_score.episodes import FloatArray, TextArray
 from evermap_score.metric import Metric
 
 LEVEL = 0.95
@@ -18,16 +18,21 @@ def draw_weights(n_units: int, n_draws: int, seed: int) -> FloatArray:
     return rng.multinomial(n_units, np.full(n_units, 1.0 / n_units), size=n_draws).astype(np.float64)
 
 
-def list_units(metrics: Sequence[Metric], *, over_sessions: bool) -> IntArray | TextArray:
-    """Return the sessions or landmarks that contribute to any of the metrics, sorted."""
-    found = [metric.session if over_sessions else metric.landmark for metric in metrics if len(metric.columns)]
-    units = np.unique(np.concatenate(found)) if found else np.empty(0, np.int64)
-    return units[units >= 0] if over_sessions else units[units != ""]
+def list_units(metrics: Sequence[Metric], *, over_sessions: bool) -> TextArray:
+    """Return the sessions or landmarks that contribute to any of the metrics, sorted, as text."""
+    found = [_units_of(metric, over_sessions) for metric in metrics if len(metric.columns)]
+    units: TextArray = np.unique(np.concatenate([np.empty(0, np.str_), *found]))
+    return units[units != ""]
 
 
-def resample(
-    metric: Metric, units: IntArray | TextArray, weights: FloatArray, *, over_sessions: bool
-) -> FloatArray:
+def _units_of(metric: Metric, over_sessions: bool) -> TextArray:
+    """Return the unit of each item (n,); empty: of none."""
+    if not over_sessions:
+        return metric.landmark
+    return np.where(metric.session < 0, "", metric.session.astype(np.str_))
+
+
+def resample(metric: Metric, units: TextArray, weights: FloatArray, *, over_sessions: bool) -> FloatArray:
     """Return the metric in each draw (draws,).
 
     Items of no unit have weight one in all draws.
@@ -39,11 +44,9 @@ def resample(
         over_sessions: whether units are sessions; else landmarks.
     """
     if len(metric.columns) == 0:
-        return np.full(len(weights), np.nan)
-    belongs = metric.session if over_sessions else metric.landmark
-    index = np.searchsorted(units, belongs)
-    of_none = (belongs < 0) if over_sessions else (belongs == "")
-    index = np.where(of_none, len(units), index)
+        return np.full(len(weights), metric.value())
+    belongs = _units_of(metric, over_sessions)
+    index = np.where(belongs == "", len(units), np.searchsorted(units, belongs))
     extended = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
     if metric.of_sums is not None:
         sums = np.zeros((len(units) + 1, metric.columns.shape[1]))

@@ -47,7 +47,7 @@ def bin_by_mass(p: FloatArray, outcome: FloatArray, weights: FloatArray, bins: i
     true = np.bincount(index, weights * outcome, minlength=len(values))
     middle = (np.cumsum(mass) - 0.5 * mass) / mass.sum()
     number = np.minimum((middle * bins).astype(np.int64), bins - 1)
-    total = np.bincount(number, mass, minlength=bins)
+    total: FloatArray = np.bincount(number, mass, minlength=bins).astype(np.float64)
     used = total > 0.0
     return ReliabilityBins(
         np.bincount(number, mass * values, minlength=bins)[used] / total[used],

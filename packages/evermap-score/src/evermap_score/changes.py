@@ -46,8 +46,8 @@ def derive_changes(table: Episodes, world: World, until_s: float = np.inf) -> li
     A landmark that is there at both instants, farther than `same_place_m` from where it was, *moved*; one that is there
     at the first only *vanished*, at the second only *appeared*, or *returned* if it was there at an earlier instant,
     wherever it is now. Where one leaves a place and another arrives at it between the same instants, both are
-    *exchanged*. What begins and ends between two instants is no change. What was there at the first instant did not
-    appear. Of several rows of a landmark at one instant the most probable counts.
+    *exchanged*. What begins and ends between two sessions is no change; without sessions each row of the table counts.
+    What was there at the first instant did not appear. Of several rows of a landmark at one instant the most probable counts.
 
     Args:
         table: episodes; those below `present_p` are left out.
@@ -55,26 +55,45 @@ def derive_changes(table: Episodes, world: World, until_s: float = np.inf) -> li
         until_s: later instants are left out.
     """
     stated = table[table.p >= world.rules.present_p]
-    instants = [(k, float(stamp_s)) for k, stamp_s in enumerate(world.instants_s) if stamp_s <= until_s]
     changes: list[Change] = []
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(stated.landmark_id.tolist()):
         rows_of.setdefault(name, []).append(row)
     for name, rows in rows_of.items():
         rows.sort(key=lambda row: -float(stated.p[row]))
+        instants_s = world.instants_s if world.are_sessions else _with_own_instants(stated, rows, world)
         was: int | None = None
-        last_seen = False
-        for k, stamp_s in instants:
+        was_seen = False
+        for k, stamp_s in enumerate(instants_s[instants_s <= until_s].tolist()):
             now = next((row for row in rows if stated.t_from_s[row] <= stamp_s < stated.t_to_s[row]), None)
-            if k > instants[0][0] and (change := _compare(stated, name, k, was, now, last_seen, world)):
+            if k > 0 and (change := _compare(stated, name, world.session_of(stamp_s), (was, now), was_seen, world)):
                 changes.append(change)
-            was, last_seen = now, last_seen or now is not None
+            was, was_seen = now, was_seen or now is not None
     return _mark_exchanges(changes, world)
 
 
+def _with_own_instants(table: Episodes, rows: Sequence[int], world: World) -> FloatArray:
+    """Return the instants of the world, with one within each row and one after the last, not before the world's first.
+
+    So nothing that a table states falls between two instants, but for an absence: it counts if the world has an instant
+    within it, and else is the time that a move took.
+    """
+    own = []
+    for row in rows:
+        start, end = float(table.t_from_s[row]), float(table.t_to_s[row])
+        if np.isfinite(start):
+            own.append(0.5 * (start + end) if np.isfinite(end) else start + 1.0)
+    ends = table.t_to_s[list(rows)]
+    if np.isfinite(ends.max()):
+        own.append(float(ends.max()) + 1.0)
+    later = [stamp_s for stamp_s in own if stamp_s > world.instants_s[0]]
+    return np.unique(np.concatenate([world.instants_s, later]))
+
+
 def _compare(
-    table: Episodes, name: str, session: int, was: int | None, now: int | None, known: bool, world: World
+    table: Episodes, name: str, session: int, rows: tuple[int | None, int | None], was_seen: bool, world: World
 ) -> Change | None:
+    was, now = rows
     if was is None and now is None:
         return None
     before, after = (None if row is None else table.position_m[row] for row in (was, now))
@@ -83,7 +102,7 @@ def _compare(
             return None
         kind = "moved"
     else:
-        kind = "vanished" if now is None else "returned" if known else "appeared"
+        kind = "vanished" if now is None else "returned" if was_seen else "appeared"
     row = was if now is None else now
     assert row is not None
     return Change(
@@ -165,7 +184,7 @@ def _may_be(truth: Sequence[Change], claims: Sequence[Change], world: World) -> 
         one, other = (_places([getattr(change, field) for change in side], world) for side in (truth, claims))
         both_absent = np.isnan(one[:, :1]) & np.isnan(other[:, 0])
         allowed = allowed & (both_absent | (distances_m(one, other) <= world.rules.match_m))
-    return allowed
+    return np.asarray(allowed)
 
 
 def _are_near(one: FloatArray | None, other: FloatArray | None, world: World) -> bool:
@@ -213,7 +232,7 @@ def change_metrics(world: World, estimate: Episodes) -> list[Metric]:
 
     A claim of a change that was never looked at is false, whatever the truth; `changes/never_looked/...` says how many
     there are and how often it was claimed. Changes with fewer looks than a threshold, and what was claimed of them,
-    are left out of the score of that threshold. A claim counts for `f1_within_3_sigma` only if each of its places is
+    are left out of the score of that threshold. Where looks are unknown there is one score, of all changes. A claim counts for `f1_within_3_sigma` only if each of its places is
     within .5 m and three of its own standard deviations of the true one.
 
     Args:
@@ -226,7 +245,9 @@ def change_metrics(world: World, estimate: Episodes) -> list[Metric]:
     pairs = dict(zip(*(side.tolist() for side in match_changes(truth, claims, world)), strict=True))
     unpaired = [claim for j, claim in enumerate(claims) if j not in set(pairs.values())]
     metrics = []
-    for least in world.rules.min_looks:
+    are_known = world.looks is not None or bool(np.isfinite(world.truth.n_looks).any())
+    have_sigmas = bool(np.isfinite(estimate.covariance_m2[:, 0, 0]).any())
+    for least in world.rules.min_looks if are_known else (0,):
         # kind, session, landmark, true, false, missed, true within sigmas
         rows: list[tuple[str, int, str, float, float, float, float]] = []
         for i, change in enumerate(truth):
@@ -240,12 +261,12 @@ def change_metrics(world: World, estimate: Episodes) -> list[Metric]:
         rows += [(claim.kind, claim.session, claim.landmark_id, 0.0, 1.0, 0.0, 0.0) for claim in unpaired]
         for kind in (*KINDS, "all"):
             items = [row[1:3] + (row[3:],) for row in rows if kind in (row[0], "all")]
-            name = f"changes/{kind}/{least}_looks"
+            name = f"changes/{kind}/{least}_looks" if are_known else f"changes/{kind}/any_looks"
             for part, of_sums in (
                 ("precision", ratio([0], [0, 1])), ("recall", ratio([0], [0, 2])), ("f1", f1_of(0, 1, 2)),
             ):  # fmt: skip
                 metrics.append(metric_of_rows(f"{name}/{part}", "", items, 4, of_sums=of_sums))
-            if kind == "all":
+            if kind == "all" and have_sigmas:
                 metrics.append(metric_of_rows(f"{name}/f1_within_3_sigma", "", items, 4, of_sums=_f1_within))
     never = [
         (change.session, change.landmark_id, (1.0, float(i in pairs)))
@@ -308,7 +329,7 @@ def _delay_metrics(world: World, estimate: Episodes) -> list[Metric]:
     Of changes that are never stated nothing is known here: they lower the recall. Without robot times: NaN.
     """
     seconds, looks = [], []
-    left = {i: change for i, change in enumerate(derive_changes(world.truth, world))}
+    left = dict(enumerate(derive_changes(world.truth, world)))
     for robot_time_s in estimate.robot_times_s().tolist() if left else []:
         claims = derive_changes(estimate.known_at(robot_time_s), world, robot_time_s)
         known = [i for i, change in left.items() if change.stamp_s <= robot_time_s]

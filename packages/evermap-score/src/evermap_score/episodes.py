@@ -12,7 +12,7 @@
 | `cov_xx_m2`, `cov_xy_m2`, `cov_xz_m2`, `cov_yy_m2`, `cov_yz_m2`, `cov_zz_m2` | optional | covariance of the place |
 | `p` | optional | probability that it is there during the interval; 1 if empty |
 | `n_looks` | optional, of the truth | how often the sensor had an opportunity to see the landmark |
-| `robot_time_s` | optional, of an estimate | rows with the same value are the map as it was then; else there is one map |
+| `robot_time_s` | optional, of an estimate | rows of one value are the map as it was then; else there is one map |
 """
 
 from __future__ import annotations
@@ -241,10 +241,10 @@ def write_episodes(table: Episodes, path: str | Path) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".parquet":
-        import pyarrow
+        import pyarrow as pa
         from pyarrow.parquet import write_table
 
-        write_table(pyarrow.table({name: [row[name] for row in rows] for name in names}), path)
+        write_table(pa.table({name: [row[name] for row in rows] for name in names}), path)
         return
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")

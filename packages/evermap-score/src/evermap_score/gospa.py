@@ -69,10 +69,10 @@ def gospa_metrics(world: World, estimate: Episodes) -> list[Metric]:
         for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
             squared = float(((at[row] - of[column]) ** 2).sum())
             items.append((k, str(truth.landmark_id[row]), (squared, 0.0, 0.0, 0.0)))
-        for row in sorted(set(range(len(truth))) - set(rows.tolist())):
-            items.append((k, str(truth.landmark_id[row]), (0.0, c_m**P / ALPHA, 0.0, 0.0)))
-        for row in sorted(set(range(len(stated))) - set(columns.tolist())):
-            items.append((k, str(stated.landmark_id[row]), (0.0, 0.0, c_m**P / ALPHA, 0.0)))
+        missed = np.delete(truth.landmark_id, rows).tolist()
+        false = np.delete(stated.landmark_id, columns).tolist()
+        items += [(k, name, (0.0, c_m**P / ALPHA, 0.0, 0.0)) for name in missed]
+        items += [(k, name, (0.0, 0.0, c_m**P / ALPHA, 0.0)) for name in false]
     return [
         metric_of_rows("gospa/total", "m", items, 4, of_sums=_total),
         *(

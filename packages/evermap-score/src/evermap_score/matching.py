@@ -78,8 +78,8 @@ def choose_instants(truth: Episodes, estimates: Sequence[Episodes], looks: LookT
     """Return the instants at which the world is compared, and whether they are ends of sessions.
 
     They are, the first of these that there is: the ends of the sessions of the looks; the robot times of the estimates;
-    the middle of every interval in which the truth is constant, and one second before its first and after its last
-    change.
+    the middle of every interval in which the truth is constant, with one second before its first and after its last
+    change, which are no sessions.
     """
     if looks is not None and len(ends := looks.session_ends_s()):
         return ends, True
@@ -205,6 +205,6 @@ def _static_places(table: Episodes, world: World) -> dict[str, FloatArray]:
 
 def aligned(estimate: Episodes, alignment: Alignment) -> Episodes:
     """Return an estimate in the frame of the truth."""
-    return replace(estimate) if alignment.n_static == 0 else estimate.moved_by(
-        alignment.rotation, alignment.translation_m
+    return (
+        replace(estimate) if alignment.n_static == 0 else estimate.moved_by(alignment.rotation, alignment.translation_m)
     )

@@ -9,10 +9,11 @@ Source: Schmid, Abate, Chang, Carlone: Khronos, RSS 2024, section V, and `Object
   the same one only the first counts, so that fragments are not counted twice.
 - Of an object of the map that is there at the query time: *detected* if its partner is there, too; else, or without a
   partner, *hallucinated*. Of an object of the truth that is there: *missed* if its partner is not, or without one.
-- Precision is detected / (detected + hallucinated), recall detected / (detected + missed); of each cell there is an F1,
-  and the number is their mean over all cells ('4D'), or over those with the last query time of each robot time ('online').
+- Precision is detected / (detected + hallucinated), recall detected / (detected + missed); of each cell there is an
+  F1, and the number is their mean over all cells ('4D'), or over those with the last query time of each robot time
+  ('online').
 
-They associate by surfaces unless told otherwise; here there are centroids only, their option `CENTROID`.
+They associate by surfaces by default; here there are centroids only, their option `CENTROID`.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def find_objects(table: Episodes, rules: Rules) -> PlacedObjects:
 
 
 def find_nearest(of: PlacedObjects, to: PlacedObjects, match_m: float) -> IntArray:
-    """Return for each object the index of the nearest one of the other table; -1: none of its class within `match_m`."""
+    """Return for each object the nearest one of the other table, of its class and within `match_m`; else -1."""
     if len(of.rows) == 0 or len(to.rows) == 0:
         return np.full(len(of.rows), -1, np.int64)
     one, other = of.class_id[:, None], to.class_id[None, :]
@@ -105,6 +106,7 @@ def presence_metrics(world: World, estimate: Episodes) -> list[Metric]:
             for name, counts in _count(objects, truth, to_truth, to_estimate, stated[:, k], there[:, k]):
                 items.append((session, name, (*counts, float(cell), online)))
             cell += 1
+
     def select(name: str, part: int, online_only: bool = False) -> Metric:
         return metric_of_rows(
             name, "", [item for item in items if item[2][4] or not online_only], 5, of_items=_MEANS[part]

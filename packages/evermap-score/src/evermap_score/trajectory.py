@@ -32,7 +32,7 @@ def read_tum(path: str | Path) -> StampedPositions:
     Raises:
         ScoreError: the file is missing, a line is not such a one, or stamps do not increase.
     """
-    rows = []
+    rows: list[list[float]] = []
     try:
         text = Path(path).read_text(encoding="utf-8")
     except OSError as error:
@@ -67,7 +67,7 @@ def trajectory_metrics(
 
     The estimate is interpolated linearly to the stamps of the truth where both are known. NaN without both.
     """
-    rows = []
+    rows: list[tuple[int, str, tuple[float, float]]] = []
     if truth is not None and estimate is not None and len(estimate.stamp_s):
         inside = (truth.stamp_s >= estimate.stamp_s[0]) & (truth.stamp_s <= estimate.stamp_s[-1])
         at_s = truth.stamp_s[inside]

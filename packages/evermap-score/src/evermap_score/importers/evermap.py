@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -133,9 +132,7 @@ def _history(changes: Iterable[dict[str, Any]], landmarks: Iterable[dict[str, An
         last_s[name] = stamp_s
     for row in landmarks:
         name = str(row["landmark_id"])
-        open_one = begun.pop(name, None)
-        if open_one is None:
-            ended.append(_open_episode(row, last_s.get(name)))
-        else:
-            ended.append(_open_episode(row, float(open_one["t_from_s"])))
-    return ended + [each for each in begun.values() if math.isfinite(float(each["t_from_s"]))]
+        # present since its last change, or, after one that ended its stay, present then with the map's probability
+        begun.pop(name, None)
+        ended.append(_open_episode(row, last_s.get(name)))
+    return ended + list(begun.values())
