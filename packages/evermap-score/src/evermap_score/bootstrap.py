@@ -22,7 +22,8 @@ def list_units(metrics: Sequence[Metric], *, over_sessions: bool) -> TextArray:
     """Return the sessions or landmarks that contribute to any of the metrics, sorted, as text."""
     found = [_units_of(metric, over_sessions) for metric in metrics if len(metric.columns)]
     units: TextArray = np.unique(np.concatenate([np.empty(0, np.str_), *found]))
-    return units[units != ""]
+    named: TextArray = units[units != ""]
+    return named
 
 
 def _units_of(metric: Metric, over_sessions: bool) -> TextArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def calibration_items(world: World, estimate: Episodes, *, ahead: bool) -> list[
     several = len(estimate.robot_times_s()) > 0
     if ahead and not several:
         return []
-    pairs = zip(instants[:-1], instants[1:], strict=True) if ahead else zip(instants, instants, strict=True)
+    pairs = pairwise(instants) if ahead else zip(instants, instants, strict=True)
     return [
         (world.session_of(query_s), name, (p, true))
         for robot_s, query_s in pairs

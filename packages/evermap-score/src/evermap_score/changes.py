@@ -47,7 +47,8 @@ def derive_changes(table: Episodes, world: World, until_s: float = np.inf) -> li
     at the first only *vanished*, at the second only *appeared*, or *returned* if it was there at an earlier instant,
     wherever it is now. Where one leaves a place and another arrives at it between the same instants, both are
     *exchanged*. What begins and ends between two sessions is no change; without sessions each row of the table counts.
-    What was there at the first instant did not appear. Of several rows of a landmark at one instant the most probable counts.
+    What was there at the first instant did not appear. Of several rows of a landmark at one instant the most probable
+    counts.
 
     Args:
         table: episodes; those below `present_p` are left out.
@@ -231,9 +232,10 @@ def change_metrics(world: World, estimate: Episodes) -> list[Metric]:
     """Return the metrics of changes of the estimate's last map.
 
     A claim of a change that was never looked at is false, whatever the truth; `changes/never_looked/...` says how many
-    there are and how often it was claimed. Changes with fewer looks than a threshold, and what was claimed of them,
-    are left out of the score of that threshold. Where looks are unknown there is one score, of all changes. A claim counts for `f1_within_3_sigma` only if each of its places is
-    within .5 m and three of its own standard deviations of the true one.
+    there are and how often one was claimed. Changes with fewer looks than a threshold, and what was claimed of them,
+    are left out of the score of that threshold. Where looks are unknown there is one score, of all changes. A claim
+    counts for `f1_within_3_sigma` only if each of its places is within `match_m` and three of its own standard
+    deviations of the true one.
 
     Args:
         world: with the truth.
@@ -266,8 +268,9 @@ def change_metrics(world: World, estimate: Episodes) -> list[Metric]:
                 ("precision", ratio([0], [0, 1])), ("recall", ratio([0], [0, 2])), ("f1", f1_of(0, 1, 2)),
             ):  # fmt: skip
                 metrics.append(metric_of_rows(f"{name}/{part}", "", items, 4, of_sums=of_sums))
-            if kind == "all" and have_sigmas:
-                metrics.append(metric_of_rows(f"{name}/f1_within_3_sigma", "", items, 4, of_sums=_f1_within))
+            if kind == "all":  # without covariances there is nothing to say
+                known = items if have_sigmas else []
+                metrics.append(metric_of_rows(f"{name}/f1_within_3_sigma", "", known, 4, of_sums=_f1_within))
     never = [
         (change.session, change.landmark_id, (1.0, float(i in pairs)))
         for i, change in enumerate(truth)
