@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,8 @@ import numpy as np
 from evermap_score.calibration import bin_by_mass
 from evermap_score.score import Report
 
-SHOWN = (
-    "changes/all/1_looks/f1", "changes/moved/1_looks/f1", "changes/vanished/1_looks/f1", "presence/f1",
-    "identity/idf1", "identity/hota",
-)  # fmt: skip
+SHOWN = re.compile(r"changes/(\w+)/(any|1)_looks/f1|presence/f1|identity/(idf1|hota)")
+"""Names of the metrics of the figure: shares, of which more is better."""
 
 
 def write_figures(report: Report, folder: str | Path) -> list[Path]:
@@ -35,8 +34,11 @@ def write_figures(report: Report, folder: str | Path) -> list[Path]:
     scores = Figure(figsize=(5.0, 2.8), layout="constrained")
     FigureCanvasAgg(scores)
     axes = scores.subplots()
-    names = [name for name in SHOWN if any(math.isfinite(each.values[name].value) for each in report.estimates
-                                           if name in each.values)]  # fmt: skip
+    names = [
+        name
+        for name in report.units
+        if SHOWN.fullmatch(name) and any(math.isfinite(each.values[name].value) for each in report.estimates)
+    ]
     for number, each in enumerate(report.estimates):
         shown = [each.values[name] for name in names]
         height = np.arange(len(names)) + 0.12 * (number - 0.5 * (len(report.estimates) - 1))

@@ -101,7 +101,7 @@ def score(
     """Score one or several estimates of a world that changes.
 
     Args:
-        truth: a table of episodes, or a file or folder that `importers.read_any` reads.
+        truth: a table of episodes, or a file or folder that `importers.read_any` reads; of several maps the last.
         estimate: the same, or several by name; the first is what the others are compared with.
         looks: opportunities to see landmarks, a table or its file; None: unknown, all landmarks were looked at.
         match: 'identity' or 'place'; None: by identity if an id is in the truth and in an estimate. Overrides `rules`.
@@ -119,7 +119,7 @@ def score(
     if match not in (None, *MATCHES):
         raise ScoreError(f"unknown way to match: {match}", hint=f"one of {', '.join(MATCHES)}")
     tables = {name: _read(source) for name, source in named.items()}
-    key = _read(truth)
+    key = _read(truth).latest()
     if len(key) == 0:
         raise ScoreError("the truth has no episode")
     seen = read_looks(looks) if isinstance(looks, str | Path) else looks
