@@ -36,6 +36,17 @@ def test_another_frame_is_found_by_static_landmarks_alone() -> None:
     assert aligned(estimate, alignment).position_m[:4, :2] == pytest.approx(TRUTH.position_m[:4, :2])
 
 
+def test_a_static_landmark_at_a_wrong_place_does_not_bend_the_frame() -> None:
+    truth = table(*((str(n), None, None, 3.0 * (n % 4), 2.5 * (n // 4)) for n in range(12)))
+    estimate = turned(truth)
+    estimate.position_m[0, :2] += 2.0
+    alignment = align(world_of(truth, estimate), estimate)
+    off_m = np.linalg.norm((aligned(estimate, alignment).position_m - truth.position_m)[1:, :2], axis=1)
+    # Huber's influence of one of twelve is that of .1 m, here .1 m / 12 in the mean; least squares would be .2 m off
+    assert off_m.max() < 0.03
+    assert alignment.rms_m == pytest.approx(2.0 * math.sqrt(2.0 / 12), rel=0.02)
+
+
 def test_a_covariance_turns_with_the_frame() -> None:
     estimate = turned(table(("a", None, None, 0, 0), cov_xx_m2=0.04, cov_xy_m2=0.0, cov_yy_m2=0.01), math.pi / 2)
     assert estimate.covariance_m2[0, :2, :2] == pytest.approx(np.diag([0.01, 0.04]))

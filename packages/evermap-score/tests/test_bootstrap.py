@@ -98,6 +98,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
         rows = [(0, f"l{k}", (float(hit), 1.0)) for k, hit in enumerate(found)]
         metric = metric_of_rows("recall", "", rows, 2, of_sums=ratio([0], [1]))
         names = list_units([metric], over_sessions=False)
-        low, high = interval(resample(metric, names, draw_weights(40, 400, int(rng.integers(1 << 30))), over_sessions=False))
+        low, high = interval(
+            resample(metric, names, draw_weights(40, 400, int(rng.integers(1 << 30))), over_sessions=False)
+        )
         held += low <= 0.7 <= high
     assert 0.88 <= held / 300 <= 0.985

@@ -15,7 +15,7 @@ from .worlds import table, values
 
 
 def by_definition(x: FloatArray, y: FloatArray, c: float) -> float:
-    """Definition 1 of the paper, for the smaller set first: min over permutations of cut-off distances, p = alpha = 2."""
+    """Definition 1 of the paper, the smaller set first, with p = alpha = 2."""
     if len(x) > len(y):
         x, y = y, x
     least = min(

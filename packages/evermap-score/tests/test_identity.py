@@ -24,7 +24,9 @@ def random_worlds(seed: int) -> tuple[Episodes, Episodes]:
                 truth.append((f"t{name}", k, k + 1, x, y))
                 if rng.random() < 0.8:
                     called = name if rng.random() < 0.7 else (name + 1) % 6
-                    estimate.append((f"e{called}{k if rng.random() < 0.1 else ''}", k, k + 1, x + rng.normal(0, 0.25), y))
+                    estimate.append(
+                        (f"e{called}{k if rng.random() < 0.1 else ''}", k, k + 1, x + rng.normal(0, 0.25), y)
+                    )
     unique = {(row[0], row[1]): row for row in estimate}
     return table(*truth), table(*unique.values())
 

@@ -83,9 +83,7 @@ def test_the_command_prints_and_writes_figures(tmp_path: Path, capsys: pytest.Ca
         (["truth.csv", "truth.csv", "--looks", "truth.csv"], "no column stamp_s"),
     ],
 )
-def test_a_mistake_is_one_line(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mistake_is_one_line(words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_episodes(TRUTH, tmp_path / "truth.csv")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ScoreError, match=re.escape(message)) as error:
