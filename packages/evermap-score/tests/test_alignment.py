@@ -115,6 +115,9 @@ def test_instants() -> None:
     # bounds 15 and 25, and from 25 on nothing: 14, 20; after the last change, 26
     truth = table(("a", None, 15, 0, 0), ("b", 15, 25, 0, 0))
     assert choose_instants(truth, [], None)[0].tolist() == [14.0, 20.0, 26.0]
+    # the first and the last are beyond what estimates state, too
+    late = table(("a", 3, 29, 0, 0))
+    assert choose_instants(truth, [late], None)[0].tolist() == [2.0, 20.0, 30.0]
     # before 15 there is nothing
     assert choose_instants(table(("b", 15, 25, 0, 0)), [], None)[0].tolist() == [20.0, 26.0]
     ends, are_sessions = choose_instants(truth, [], looks_at([5.0, 50.0], {"a": [1.0]}))

@@ -78,23 +78,29 @@ def choose_instants(truth: Episodes, estimates: Sequence[Episodes], looks: LookT
     """Return the instants at which the world is compared, and whether they are ends of sessions.
 
     They are, the first of these that there is: the ends of the sessions of the looks; the robot times of the estimates;
-    the middle of every interval in which the truth is constant, with one second before its first and after its last
-    change, which are no sessions.
+    the middle of every interval in which the truth is constant, with one second before the first and after the last
+    bound of all tables, which are no sessions.
     """
     if looks is not None and len(ends := looks.session_ends_s()):
         return ends, True
     times = np.unique(np.concatenate([np.empty(0), *(estimate.robot_times_s() for estimate in estimates)]))
     if len(times) > 1:
         return times, True
-    bounds = np.unique(np.concatenate([truth.t_from_s, truth.t_to_s]))
-    bounds = bounds[np.isfinite(bounds)]
-    if len(bounds) == 0:
+    bounds = _finite_bounds_s([truth])
+    of_all = _finite_bounds_s([truth, *estimates])
+    if len(of_all) == 0:
         return np.zeros(1), False
     inner = 0.5 * (bounds[1:] + bounds[:-1])
-    instants = np.concatenate([[bounds[0] - 1.0], inner, [bounds[-1] + 1.0]])
+    # what is stated late is asked for when it is stated, too
+    instants = np.concatenate([[of_all[0] - 1.0], inner, [of_all[-1] + 1.0]])
     inhabited = [bool(truth.is_present(stamp_s).any()) for stamp_s in instants]
     first = int(np.argmax(inhabited))  # before the first landmark there is nothing to compare
     return instants[first:] if any(inhabited) else instants, False
+
+
+def _finite_bounds_s(tables: Sequence[Episodes]) -> FloatArray:
+    bounds = np.unique(np.concatenate([side for each in tables for side in (each.t_from_s, each.t_to_s)]))
+    return bounds[np.isfinite(bounds)]
 
 
 def choose_match(truth: Episodes, estimates: Sequence[Episodes]) -> str:
