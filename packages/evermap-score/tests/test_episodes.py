@@ -45,6 +45,13 @@ def test_the_end_is_excluded() -> None:
     assert [bool(table.is_present(stamp_s)[0]) for stamp_s in (0.9, 1.0, 1.9, 2.0)] == [False, True, True, False]
 
 
+def test_at_one_instant_a_landmark_is_at_its_most_probable_place() -> None:
+    rows = [PLAIN | {"x_m": n, "p": p} for n, p in enumerate((0.2, 0.7, 0.6))] + [PLAIN | {"landmark_id": 8, "p": 0.3}]
+    table = episodes_from_rows(rows)
+    assert table.state_at(0.0).position_m[:, 0].tolist() == [1.0, 1000.0]
+    assert table.state_at(0.0, 0.5).landmark_id.tolist() == ["7"]
+
+
 def test_maps_by_robot_time() -> None:
     table = episodes_from_rows([PLAIN | {"robot_time_s": 10}, PLAIN | {"robot_time_s": 20, "x_m": 5}])
     assert table.robot_times_s().tolist() == [10.0, 20.0]

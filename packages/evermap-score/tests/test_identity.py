@@ -100,6 +100,16 @@ def test_hota_of_a_name_that_changes_half_way() -> None:
     assert found["identity/idf1"] == pytest.approx(0.5)
 
 
+def test_rows_that_overlap_by_rounding_are_one_landmark() -> None:
+    # .1 * 3 is more than .3: at some boundaries both rows of a landmark hold
+    rows = [("a", 0.1 * k - 0.05, 0.1 * k + 0.05, 0.2 * k, 0) for k in range(40)]
+    assert any(one[2] > other[1] for one, other in itertools.pairwise(rows))
+    truth = table(*rows)
+    found = values(truth, truth)
+    assert found["identity/idf1"] == found["identity/hota"] == 1.0
+    assert len(world_of(truth, truth).instants_s) == 41
+
+
 def test_hota_counts_a_distance_by_its_similarity() -> None:
     # .25 m is a similarity of .75: a match at 15 of 19 thresholds (.05, ..., .75), a miss and a false one at four
     truth, estimate = table(("a", 0, 1, 0, 0)), table(("a", 0, 1, 0.25, 0))

@@ -77,7 +77,7 @@ def claims_at(world: World, estimate: Episodes, query_s: float) -> list[tuple[st
     the estimate has no row, is a statement with probability 0: an estimate does not gain by silence. Of a landmark that
     was never looked at a missing row is no statement.
     """
-    truth = world.truth[world.truth.is_present(query_s)]
+    truth = world.truth.state_at(query_s)
     stated = estimate[estimate.is_present(query_s)]
     true_rows, rows = pair_rows(truth, stated, world.rules)
     partner = dict(zip(rows.tolist(), true_rows.tolist(), strict=True))

@@ -87,6 +87,13 @@ class Episodes:
         """Say of each row whether its interval holds an instant."""
         return (self.t_from_s <= stamp_s) & (stamp_s < self.t_to_s)
 
+    def state_at(self, stamp_s: float, least_p: float = 0.0) -> Episodes:
+        """Return the rows that hold an instant, with at least a probability; of a landmark the most probable one."""
+        rows = np.flatnonzero(self.is_present(stamp_s) & (self.p >= least_p))
+        rows = rows[np.argsort(-self.p[rows], kind="stable")]
+        first = np.unique(self.landmark_id[rows], return_index=True)[1]
+        return self[np.sort(rows[first])]
+
     def robot_times_s(self) -> FloatArray:
         """Return the robot times of its maps, sorted; none if there is one map only."""
         return np.unique(self.robot_time_s[np.isfinite(self.robot_time_s)])

@@ -60,9 +60,8 @@ def gospa_metrics(world: World, estimate: Episodes) -> list[Metric]:
     dim, c_m = world.rules.dim, world.rules.gospa_c_m
     items: list[tuple[int, str, tuple[float, float, float, float]]] = []
     for k, stamp_s in enumerate(world.instants_s.tolist()):
-        truth = world.truth[world.truth.is_present(stamp_s)]
-        known = estimate.known_at(stamp_s)
-        stated = known[known.is_present(stamp_s) & (known.p >= world.rules.present_p)]
+        truth = world.truth.state_at(stamp_s)
+        stated = estimate.known_at(stamp_s).state_at(stamp_s, world.rules.present_p)
         at, of = truth.position_m[:, :dim], stated.position_m[:, :dim]
         rows, columns = pair_points(at, of, c_m)
         items.append((k, "", (0.0, 0.0, 0.0, 1.0)))

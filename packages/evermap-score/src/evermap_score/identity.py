@@ -44,9 +44,8 @@ def make_frames(world: World, estimate: Episodes) -> tuple[list[IdentityFrame], 
     names, of = np.unique(world.truth.landmark_id), np.unique(estimate.landmark_id)
     frames = []
     for stamp_s in world.instants_s.tolist():
-        truth = world.truth[world.truth.is_present(stamp_s)]
-        known = estimate.known_at(stamp_s)
-        stated = known[known.is_present(stamp_s) & (known.p >= rules.present_p)]
+        truth = world.truth.state_at(stamp_s)
+        stated = estimate.known_at(stamp_s).state_at(stamp_s, rules.present_p)
         away = distances_m(truth.position_m[:, : rules.dim], stated.position_m[:, : rules.dim])
         similarity = np.where(agree_classes(truth, stated), np.maximum(1.0 - away / (2.0 * rules.match_m), 0.0), 0.0)
         frames.append(

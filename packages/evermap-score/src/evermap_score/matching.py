@@ -12,6 +12,10 @@ from evermap_score.episodes import BoolArray, Episodes, FloatArray, IntArray, Lo
 MATCHES = ("identity", "place")
 
 
+SAME_INSTANT_S = 1e-6
+"""Ends and beginnings that differ by less are the same: they were rounded."""
+
+
 @dataclass(frozen=True)
 class Rules:
     """The rules of a comparison.
@@ -100,7 +104,8 @@ def choose_instants(truth: Episodes, estimates: Sequence[Episodes], looks: LookT
 
 def _finite_bounds_s(tables: Sequence[Episodes]) -> FloatArray:
     bounds = np.unique(np.concatenate([side for each in tables for side in (each.t_from_s, each.t_to_s)]))
-    return bounds[np.isfinite(bounds)]
+    bounds = bounds[np.isfinite(bounds)]
+    return bounds[np.diff(bounds, prepend=-np.inf) > SAME_INSTANT_S]
 
 
 def choose_match(truth: Episodes, estimates: Sequence[Episodes]) -> str:

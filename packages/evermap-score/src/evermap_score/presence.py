@@ -13,6 +13,7 @@ Source: Schmid, Abate, Chang, Carlone: Khronos, RSS 2024, section V, and `Object
   F1, and the number is their mean over all cells ('4D'), or over those with the last query time of each robot time
   ('online').
 
+So what moves by less than .5 m goes to its old place, which is the nearest object, and is hallucinated afterwards.
 They associate by surfaces by default; here there are centroids only, their option `CENTROID`.
 """
 
