@@ -163,6 +163,15 @@ def test_sigmas_and_squared_errors_by_covariance() -> None:
     assert found["displacement/nees_by_dof"] == pytest.approx((0.55 + 4.0) / 2)
 
 
+def test_a_wide_covariance_does_not_make_a_far_claim_good() -> None:
+    # .8 m off, with a sigma of 1 m: within 3 sigma, and not within .5 m
+    truth = table(("b", None, 15, 5, 0), ("b", 15, None, 6, 0))
+    estimate = table(("b", None, 15, 5, 0), ("b", 15, None, 6.8, 0), cov_xx_m2=1.0, cov_xy_m2=0.0, cov_yy_m2=1.0)
+    found = values(truth, estimate)
+    assert found["changes/all/any_looks/f1"] == 1.0
+    assert found["changes/all/any_looks/f1_within_3_sigma"] == 0.0
+
+
 def join(*tables: Episodes) -> Episodes:
     from evermap_score.episodes import episodes_from_rows, rows_of
 

@@ -13,14 +13,14 @@ from evermap_score.identity import ALPHAS, hota_items, make_frames, pair_identit
 from .worlds import table, values, world_of
 
 
-def random_worlds(seed: int) -> tuple[Episodes, Episodes]:
+def random_worlds(seed: int, apart_m: float = 3.0) -> tuple[Episodes, Episodes]:
     """Six landmarks over six intervals of a second; the estimate misses some, is off, and swaps names."""
     rng = np.random.default_rng(seed)
     truth, estimate = [], []
     for name in range(6):
         for k in range(6):
             if rng.random() < 0.8:
-                x, y = 3.0 * (name % 3) + 0.1 * k, 3.0 * (name // 3)
+                x, y = apart_m * (name % 3) + 0.1 * k, apart_m * (name // 3)
                 truth.append((f"t{name}", k, k + 1, x, y))
                 if rng.random() < 0.8:
                     called = name if rng.random() < 0.7 else (name + 1) % 6
@@ -44,10 +44,12 @@ def test_idf1_is_that_of_motmetrics(seed: int) -> None:
     assert values(truth, estimate)["identity/idf1"] == pytest.approx(float(reference))
 
 
+@pytest.mark.parametrize("apart_m", [0.4, 3.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_hota_is_that_of_trackeval(seed: int) -> None:
+def test_hota_is_that_of_trackeval(seed: int, apart_m: float) -> None:
+    """Also where landmarks are so close that who is with whom is decided by the whole time."""
     trackeval = pytest.importorskip("trackeval")
-    truth, estimate = random_worlds(seed)
+    truth, estimate = random_worlds(seed, apart_m)
     frames, names, of = make_frames(world_of(truth, estimate), estimate)
     reference = trackeval.metrics.HOTA({"PRINT_CONFIG": False}).eval_sequence({
         "num_timesteps": len(frames), "num_gt_ids": len(names), "num_tracker_ids": len(of),

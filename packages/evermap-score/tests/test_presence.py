@@ -43,6 +43,14 @@ def test_a_match_needs_no_presence_and_no_name() -> None:
     assert found["presence/precision"] == pytest.approx((1 + 1 / 2 + 1 / 2) / 3)
 
 
+def test_what_is_improbable_is_not_stated() -> None:
+    rows = (("a", None, None, 0, 0), ("b", None, 15, 5, 0), ("c", 25, None, 0, 5))
+    assert values(TRUTH, table(*rows, ("x", None, None, 9, 9, 0.49)))["presence/precision"] == 1.0
+    # one of three at 14, one of two at 20, one of three at 26 is hallucinated
+    found = values(TRUTH, table(*rows, ("x", None, None, 9, 9, 0.5)))
+    assert found["presence/precision"] == pytest.approx((2 / 3 + 1 / 2 + 2 / 3) / 3)
+
+
 def test_fragments_count_once() -> None:
     truth = table(("a", None, None, 0, 0), ("b", None, 15, 5, 0))
     fragments = table(("a", None, None, 0, 0), ("a2", None, None, 0.3, 0), ("b", None, 15, 5, 0))
