@@ -84,6 +84,10 @@ def test_runs_that_follow_each_other_are_maps_by_robot_time(tmp_path: Path) -> N
     assert table.robot_times_s().tolist() == [90.0, 210.0, 310.0]
     assert [row[1:3] for row in spans(table.known_at(90.0))] == [(None, None)] * 3
     assert spans(table.known_at(210.0)) == sorted(AFTER_TUESDAY, key=repr)
+    # the place before has the covariance of the map before
+    gone = table.latest()
+    gone = gone[(gone.landmark_id == "2") & (gone.t_to_s == 255.0)]
+    assert gone.covariance_m2[0, :2, :2].tolist() == [[0.01, 0.0], [0.0, 0.04]]
     of_two = [row for row in spans(table.latest()) if row[0] == "2"]
     assert {row[1:4] for row in of_two} == {(None, 150.0, 5.0), (150.0, 255.0, 6.0), (255.0, None, 7.0)}
 
@@ -92,6 +96,9 @@ def test_such_runs_score_perfectly_against_themselves(tmp_path: Path) -> None:
     write_run(tmp_path / "a", MONDAY, "", 90.0)
     write_run(tmp_path / "b", TUESDAY, OF_TUESDAY, 210.0)
     found = score(tmp_path / "b", tmp_path, draws=0)
+    # the moved one has covariances at both places, the one that vanished that of Monday, the new one its own
+    assert found["changes/all/any_looks/f1_within_3_sigma"].value == 1.0
+    assert found["presence/f1"].value == 1.0
     assert found["changes/moved/any_looks/f1"].value == found["changes/vanished/any_looks/f1"].value == 1.0
     # Monday's map was right about Monday; of Tuesday's map all is right, too
     assert found["changes/delay"].value == pytest.approx((60 + 70 + 50) / 3)

@@ -170,7 +170,10 @@ def make_world(
     match: str | None = None,
     rules: Rules | None = None,
 ) -> World:
-    """Return the truth with the instants and rules by which all estimates are compared with it."""
+    """Return the truth with the instants and rules by which all estimates are compared with it.
+
+    Rows of the truth below `present_p`, which a run of evermap has that is taken for it, are left out.
+    """
     from dataclasses import replace
 
     tables = [table for table in estimates.values() if len(table)]
@@ -180,6 +183,7 @@ def make_world(
         match=match or (given.match if rules else choose_match(truth, tables)),
         in_space=all(table.in_space for table in (truth, *tables)),
     )
+    truth = truth[truth.p >= chosen.present_p]
     instants_s, are_sessions = choose_instants(truth, tables, looks)
     return World(truth, instants_s, are_sessions, looks, chosen)
 

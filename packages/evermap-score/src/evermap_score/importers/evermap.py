@@ -41,7 +41,8 @@ def read_run(path: str | Path) -> Episodes:
 def read_runs(path: str | Path) -> Episodes:
     """Read a folder of runs that follow each other in one map: after each session there is a map, its robot time.
 
-    The robot time is the last stamp of `trajectory.tum`. Of a landmark all changes until then are known.
+    The robot time is the last stamp of `trajectory.tum`. Of a landmark all changes until then are known. A place before
+    a change has the covariance of the map before that session.
 
     Raises:
         ScoreError: no folder in it is a run, or one has no trajectory.
@@ -58,9 +59,12 @@ def read_runs(path: str | Path) -> Episodes:
         raise ScoreError("neither a run of evermap nor a folder of runs", path=path, hint="map.parquet is missing")
     rows: list[dict[str, Any]] = []
     changes: list[dict[str, Any]] = []
+    covariances: dict[str, dict[str, Any]] = {}
     for robot_time_s, folder in sorted(runs):
-        changes += _change_rows(folder)
-        now = _history(changes, _map_rows(folder / "map.parquet"))
+        changes += [row | covariances.get(str(row["id"]), {}) for row in _change_rows(folder)]
+        landmarks = _map_rows(folder / "map.parquet")
+        now = _history(changes, landmarks)
+        covariances = {str(row["landmark_id"]): {name: row.get(name) for name in COVARIANCE} for row in landmarks}
         rows += [row | {"robot_time_s": robot_time_s} for row in now]
     return episodes_from_rows(rows, path)
 
@@ -122,7 +126,8 @@ def _history(changes: Iterable[dict[str, Any]], landmarks: Iterable[dict[str, An
         name, stamp_s = str(row["id"]), float(row["stamp_s"])
         episode = {"landmark_id": name, "class_id": row["class"], **{axis: row.get(axis) for axis in _PLACE}}
         if row["where"] == "before":
-            open_one = begun.pop(name, episode | {"t_from_s": last_s.get(name)})
+            known = {each: row[each] for each in COVARIANCE if row.get(each) is not None}
+            open_one = begun.pop(name, episode | {"t_from_s": last_s.get(name)}) | known
             if open_one["t_from_s"] is None or float(open_one["t_from_s"]) < stamp_s:
                 ended.append(open_one | {"t_to_s": stamp_s})
         else:
