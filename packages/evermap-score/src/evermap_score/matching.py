@@ -105,7 +105,8 @@ def choose_instants(truth: Episodes, estimates: Sequence[Episodes], looks: LookT
 def _finite_bounds_s(tables: Sequence[Episodes]) -> FloatArray:
     bounds = np.unique(np.concatenate([side for each in tables for side in (each.t_from_s, each.t_to_s)]))
     bounds = bounds[np.isfinite(bounds)]
-    return bounds[np.diff(bounds, prepend=-np.inf) > SAME_INSTANT_S]
+    kept: FloatArray = bounds[np.diff(bounds, prepend=-np.inf) > SAME_INSTANT_S]
+    return kept
 
 
 def choose_match(truth: Episodes, estimates: Sequence[Episodes]) -> str:
