@@ -20,6 +20,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -275,8 +276,15 @@ class LookTable:
 
     def count(self, landmark_id: str, from_s: float, to_s: float) -> int:
         """Count the looks at a landmark after `from_s` and until `to_s`."""
-        at = self.stamp_s[self.landmark_id == landmark_id]
-        return int(np.count_nonzero((at > from_s) & (at <= to_s)))
+        at = self._stamps_of.get(landmark_id)
+        return 0 if at is None else int(np.diff(np.searchsorted(at, [from_s, to_s], side="right"))[0])
+
+    @cached_property
+    def _stamps_of(self) -> dict[str, FloatArray]:
+        """Sorted stamps by landmark: a table may have a million looks, and is asked for each landmark and instant."""
+        order = np.lexsort((self.stamp_s, self.landmark_id))
+        names, starts = np.unique(self.landmark_id[order], return_index=True)
+        return dict(zip(names.tolist(), np.split(self.stamp_s[order], starts[1:]), strict=True)) if len(names) else {}
 
     def session_ends_s(self) -> FloatArray:
         """Return the last stamp of each session, sorted; none without the column `session_id`."""
