@@ -147,9 +147,9 @@ def _places(places: Sequence[FloatArray | None], world: World) -> FloatArray:
 def match_changes(truth: Sequence[Change], estimate: Sequence[Change], world: World) -> tuple[IntArray, IntArray]:
     """Pair changes one to one: of the same kind and, by the rules, the same landmark or the same places.
 
-    By identity the places do not matter: their errors are scored by themselves. By place, the place before and the place after must both be within `match_m`, where there is one, and the classes
-    equal where both are known. Of several pairings, one with most pairs and of these the least total difference of
-    times.
+    By identity the places do not matter: their errors are scored by themselves. By place, the place before and the
+    place after must both be within `match_m`, where there is one, and the classes equal where both are known. Of
+    several pairings, one with most pairs and of these the least total difference of times.
     """
     rows, columns = [], []
     for kind in KINDS:
