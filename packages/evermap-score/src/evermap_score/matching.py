@@ -51,7 +51,7 @@ class World:
     Attributes:
         truth: episodes.
         instants_s: sorted instants (k,) at which the world is compared.
-        are_sessions: whether each instant is the end of a session, and not one chosen for want of sessions.
+        are_sessions: whether each instant is the end of a session, and not one between changes of the truth.
         looks: opportunities to see landmarks; None if unknown.
         rules: of the comparison.
     """

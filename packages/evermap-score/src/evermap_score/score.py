@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,17 @@ from evermap_score.errors import ScoreError
 from evermap_score.gospa import gospa_metrics
 from evermap_score.identity import identity_metrics
 from evermap_score.importers import read_any
-from evermap_score.matching import MATCHES, Alignment, Rules, World, align, aligned, choose_instants, choose_match
+from evermap_score.matching import (
+    IDENTITY,
+    MATCHES,
+    Alignment,
+    Rules,
+    World,
+    align,
+    aligned,
+    choose_instants,
+    choose_match,
+)
 from evermap_score.metric import Metric
 from evermap_score.presence import presence_metrics
 from evermap_score.trajectory import StampedPositions, find_trajectory, read_tum, trajectory_metrics
@@ -174,8 +184,6 @@ def make_world(
 
     Rows of the truth below `present_p`, which a run of evermap has that is taken for it, are left out.
     """
-    from dataclasses import replace
-
     tables = [table for table in estimates.values() if len(table)]
     given = rules or Rules()
     chosen = replace(
@@ -196,8 +204,6 @@ def measure(
     alignment: Alignment | None = None,
 ) -> list[Metric]:
     """Return all metrics of an estimate, with their items."""
-    from evermap_score.matching import IDENTITY
-
     return [
         *change_metrics(world, estimate),
         *calibration_metrics(world, estimate),
