@@ -124,14 +124,14 @@ $(VENV)/bin/python:
 	@$(PIP_INSTALL) --only-binary :all: uv==0.13.9 2>/dev/null || true
 
 # The lock files pin every version; the project itself is installed in place, without resolving anything.
-$(RUNTIME): requirements.lock pyproject.toml studies/pyproject.toml | $(VENV)/bin/python
+$(RUNTIME): requirements.lock pyproject.toml studies/pyproject.toml packages/evermap-score/pyproject.toml | $(VENV)/bin/python
 	@$(call install,--requirement requirements.lock)
-	@$(call install,--no-deps --no-build-isolation --editable . --editable ./studies)
+	@$(call install,--no-deps --no-build-isolation --editable . --editable ./studies --editable ./packages/evermap-score)
 	@touch $@
 
-$(DEVELOPMENT): requirements-dev.lock pyproject.toml studies/pyproject.toml | $(VENV)/bin/python
+$(DEVELOPMENT): requirements-dev.lock pyproject.toml studies/pyproject.toml packages/evermap-score/pyproject.toml | $(VENV)/bin/python
 	@$(call install,--requirement requirements-dev.lock)
-	@$(call install,--no-deps --no-build-isolation --editable . --editable ./studies)
+	@$(call install,--no-deps --no-build-isolation --editable . --editable ./studies --editable ./packages/evermap-score)
 	@touch $(RUNTIME) $@
 
 $(DOCUMENTATION): requirements-docs.lock | $(VENV)/bin/python
@@ -153,4 +153,4 @@ lock: $(DEVELOPMENT)
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find src studies tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src studies packages tests -name __pycache__ -type d -prune -exec rm -rf {} +

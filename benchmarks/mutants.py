@@ -231,7 +231,8 @@ def pytest_sessionfinish():
 
 def run_tests(tests: Sequence[str], source: Path, scratch: Path, timeout_s: float, **more: str) -> int:
     """Run tests against a copy of the sources and return pytest's exit code, -1 where it took too long."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(source), str(ROOT / "studies" / "src"), str(scratch)]),
+    beside = (str(ROOT / each) for each in ("studies/src", "packages/evermap-score/src"))
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(source), *beside, str(scratch)]),
            "OPENBLAS_NUM_THREADS": "1", **more}  # fmt: skip
     line = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", "-o", "pythonpath=",
             *(["-p", "which_calls"] if more else ["-x"]), *tests]  # fmt: skip

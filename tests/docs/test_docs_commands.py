@@ -39,6 +39,7 @@ from .warm_commands import warm_commands
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+SOURCES = ("src", "studies/src", "packages/evermap-score/src")
 GENERATED = "reference/"
 """Pages that exist only in the site; `mkdocs build --strict` checks what leads there."""
 TIMEOUT_S = 300
@@ -105,7 +106,7 @@ def environment() -> dict[str, str]:
     """As after activating the environment that runs the tests: `evermap` and `python` are those of this checkout."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     source = os.pathsep.join(
-        filter(None, [str(REPOSITORY / "src"), str(REPOSITORY / "studies" / "src"), os.environ.get("PYTHONPATH", "")])
+        filter(None, [*(str(REPOSITORY / each) for each in SOURCES), os.environ.get("PYTHONPATH", "")])
     )
     return {**os.environ, "PATH": path, "PYTHONPATH": source, "MPLBACKEND": "agg", "NO_COLOR": "1"}
 

@@ -11,8 +11,11 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
-ROOTS = [REPOSITORY, *(REPOSITORY / root for root in ("src/evermap", "src", "studies/src", "docs"))]
-DOTTED = re.compile(r"(evermap(?:_studies)?(?:\.\w+)+)(?:\(.*)?")
+ROOTS = [
+    REPOSITORY,
+    *(REPOSITORY / root for root in ("src/evermap", "src", "studies/src", "packages/evermap-score/src", "docs")),
+]
+DOTTED = re.compile(r"(evermap(?:_studies|_score)?(?:\.\w+)+)(?:\(.*)?")
 OTHERS = {"evermap.coordinates"}
 """Keys of files that look like modules."""
 FILE = re.compile(r"(?:[\w-]+/)+[\w-]+\.(?:py|toml)")

@@ -35,7 +35,9 @@ def test_the_citation_is_valid_and_of_this_version() -> None:
         assert all("family-names" in author for author in reference["authors"])
 
 
-@pytest.mark.parametrize("package", ["src/evermap", "studies/src/evermap_studies"])
+@pytest.mark.parametrize(
+    "package", ["src/evermap", "studies/src/evermap_studies", "packages/evermap-score/src/evermap_score"]
+)
 def test_a_package_says_that_it_is_typed(package: str) -> None:
     assert (REPOSITORY / package / "py.typed").is_file()
 

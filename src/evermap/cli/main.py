@@ -29,6 +29,7 @@ from evermap.cli import (
     moved,
     persist,
     reproduce,
+    score,
     serve,
     slam,
     survival,
@@ -156,6 +157,7 @@ app.command("persist", help=persist.HELP)(persist.persist)
 app.command("track", help=track.HELP)(track.track)
 app.command("view")(view.view)
 app.command("convert")(convert.convert)
+app.command("score", context_settings=score.PASSED_ON)(score.score)
 app.add_typer(living_map.app)
 app.add_typer(serve.app)
 app.command("work")(serve.work)
