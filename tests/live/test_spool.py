@@ -15,7 +15,7 @@ import pytest
 from evermap.config import Config, LiveConfig
 from evermap.errors import DataError, InputError
 from evermap.live import spool as spooling
-from evermap.live.parts import pack_part, unpack_parts
+from evermap.live.parts import close_parts, pack_part, unpack_parts
 from evermap.live.spool import Spool, enter_waiting, recover
 from evermap.maps.store import open_store
 from evermap.maps.store.measured import pack_recording
@@ -49,7 +49,8 @@ def part_of(k: int, n_frames: int = 3) -> Recording:
 
 PARTS = [part_of(k) for k in range(1, COUNT + 1)]
 BLOCKS = [pack_part(k, part) for k, part in enumerate(PARTS, start=1)]
-FILE = b"".join(BLOCKS)
+OPEN = b"".join(BLOCKS)
+FILE = OPEN + close_parts(OPEN)
 
 
 def numbers_of(recordings: tuple[AnyRecording, ...]) -> list[int]:
@@ -69,8 +70,7 @@ def test_a_flipped_bit_costs_one_part(seed: int) -> None:
         parts = unpack_parts(bytes(data))
         hit = int(np.searchsorted(np.cumsum([len(block) for block in BLOCKS]), at, side="right")) + 1
         assert numbers_of(parts.recordings) == [k for k in range(1, COUNT + 1) if k != hit]
-        assert parts.lost in ((hit,), (UNKNOWN,) if hit == COUNT else (hit,))
-        assert parts.damage.startswith(f"1 of {COUNT} parts")
+        assert parts.lost == ((hit,) if hit <= COUNT else (UNKNOWN,))
 
 
 def test_every_bit_of_a_header_may_be_flipped() -> None:
@@ -85,11 +85,21 @@ def test_every_bit_of_a_header_may_be_flipped() -> None:
 
 @pytest.mark.parametrize("left", [1, 7, 8, 27, 28, 29, 300])
 def test_a_part_that_a_crash_cut_off_was_never_there(left: int) -> None:
-    parts = unpack_parts(b"".join(BLOCKS[:3]) + BLOCKS[3][:left])
+    data = b"".join(BLOCKS[:3]) + BLOCKS[3][:left]
+    parts = unpack_parts(data + close_parts(data))
     assert numbers_of(parts.recordings) == [1, 2, 3]
     assert not parts.lost
-    alone = unpack_parts(BLOCKS[0][:left])
-    assert not alone.recordings
+    assert not unpack_parts(BLOCKS[0][:left]).recordings
+
+
+@pytest.mark.parametrize("at", range(0, len(FILE), 1371))
+def test_a_file_that_lost_its_end_says_so(at: int) -> None:
+    """Other than one that a crash ended, which was closed when it was found."""
+    parts = unpack_parts(FILE[:at])
+    whole = int(np.searchsorted(np.cumsum([len(block) for block in BLOCKS]), at, side="right"))
+    assert numbers_of(parts.recordings) == list(range(1, whole + 1))
+    assert bool(parts.damage) == (at > 0)
+    assert close_parts(FILE) == b""
 
 
 @pytest.mark.parametrize(
@@ -101,14 +111,15 @@ def test_a_part_that_a_crash_cut_off_was_never_there(left: int) -> None:
         ([BLOCKS[0], *BLOCKS], [1, 2, 3, 4, 5, 6], ()),
         ([*BLOCKS[:2], b"\0" * 512, *BLOCKS[2:]], [1, 2, 3, 4, 5, 6], ()),
         ([*BLOCKS[:2], BLOCKS[2][:100], *BLOCKS[3:]], [1, 2, 4, 5, 6], (3,)),
-        ([*BLOCKS, b"\0" * 512], [1, 2, 3, 4, 5, 6], (UNKNOWN,)),
+        (BLOCKS[:4], [1, 2, 3, 4], (5, 6)),
         ([b"nothing of ours" * 9], [], (UNKNOWN,)),
         ([], [], ()),
     ],
-    ids=["hole", "begin", "swapped", "twice", "zeros", "cut within", "tail", "other", "empty"],
+    ids=["hole", "begin", "swapped", "twice", "zeros", "cut within", "end", "other", "empty"],
 )
 def test_what_is_intact_is_found_in_its_order(blocks: list[bytes], found: list[int], lost: tuple[int, ...]) -> None:
-    parts = unpack_parts(b"".join(blocks))
+    end = FILE[len(OPEN) :] if found else b""
+    parts = unpack_parts(b"".join(blocks) + end)
     assert numbers_of(parts.recordings) == found
     assert parts.lost == lost
 
@@ -119,7 +130,13 @@ def test_parts_without_marks_are_read_up_to_damage() -> None:
     whole = unpack_parts(b"".join(blocks))
     assert numbers_of(whole.recordings) == [1, 2, 3, 4, 5, 6]
     assert not whole.lost
-    assert numbers_of(unpack_parts(b"".join(blocks)[:-20]).recordings) == [1, 2, 3, 4, 5]
+    cut = unpack_parts(b"".join(blocks)[:-20])
+    assert numbers_of(cut.recordings) == [1, 2, 3, 4, 5]
+    assert cut.lost == (UNKNOWN,)
+    for bit in range(64):  # of a length
+        length = bytearray(b"".join(blocks))
+        length[len(blocks[0]) + bit // 8] ^= 1 << bit % 8
+        assert unpack_parts(bytes(length)).lost == (UNKNOWN,)
     hit = bytearray(b"".join(blocks))
     hit[len(blocks[0]) + len(blocks[1]) // 2] ^= 1
     damaged = unpack_parts(bytes(hit))

@@ -2,7 +2,7 @@
 
 Each part begins with a mark, its number, its length and two checksums: of this header, and of the bytes behind it. What
 cannot be read is skipped up to the next valid header, as readers of MCAP do: a damaged length loses one part, not all
-behind it. Parts that are missing show by their numbers.
+behind it. Parts that are missing show by their numbers, and at the end by a header without a part that closes the file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ _UNMARKED = 8
 
 
 class Header(NamedTuple):
-    """Start of a part: its number from 1, the length of its bytes, and their checksum."""
+    """Start of a part: its number from 1, the length of its bytes, and their checksum.
+
+    At the end of a file: the number of its parts, and no bytes.
+    """
 
     number: int
     size: int
@@ -65,33 +68,47 @@ def pack_part(number: int, recording: AnyRecording) -> bytes:
         recording: its readings.
     """
     body = pack_recording(recording)
+    return _pack_header(number, body) + body
+
+
+def close_parts(data: bytes) -> bytes:
+    """Return what closes a file, behind parts that a crash may have ended: one that it cut off never was there."""
+    count, end = 0, 0
+    for at, header in _find_headers(data):
+        end = at + _HEADER_SIZE + header.size
+        if not header.size:
+            return b""
+        if end <= len(data):
+            count = max(count, header.number)
+    return _pack_header(count, b"") if count else b""
+
+
+def _pack_header(number: int, body: bytes) -> bytes:
     header = _HEADER.pack(MARK, number, len(body), zlib.crc32(body))
-    return header + _CHECKSUM.pack(zlib.crc32(header)) + body
+    return header + _CHECKSUM.pack(zlib.crc32(header))
 
 
 def unpack_parts(data: bytes) -> DriveParts:
-    """Return the parts of a file. The last one may be cut off, as by a crash while it was written: it never was there.
+    """Return the parts of a file that was closed.
 
     Args:
-        data: what `pack_part` returned, one after the other, possibly damaged.
+        data: what `pack_part` and `close_parts` returned, one after the other, possibly damaged.
     """
     headers = list(_find_headers(data))
     if not headers:
         return _unpack_unmarked(data)
-    found, count, end = dict[int, AnyRecording](), 0, 0
+    found, closed = dict[int, AnyRecording](), None
     for at, header in headers:
-        end = at + _HEADER_SIZE + header.size
-        body = data[at + _HEADER_SIZE : end]
-        if end > len(data) and at == headers[-1][0]:
-            count = max(count, header.number - 1)
-            break
-        count = max(count, header.number)
-        if len(body) == header.size and zlib.crc32(body) == header.checksum:
+        body = data[at + _HEADER_SIZE : at + _HEADER_SIZE + header.size]
+        if not header.size:
+            closed = header.number
+        elif len(body) == header.size and zlib.crc32(body) == header.checksum:
             with suppress(DamagedError):  # one of a newer version
                 found.setdefault(header.number, unpack_recording(body))
+    count = max(header.number for _, header in headers) if closed is None else closed
     lost = sorted(set(range(1, count + 1)) - found.keys())
-    if end < len(data) and not _is_cut_header(data[end:]):
-        lost.append(UNKNOWN)  # behind the last header that is valid
+    if closed is None:  # and how many were behind them
+        lost.append(UNKNOWN)
     return DriveParts(tuple(found[number] for number in sorted(found)), tuple(lost))
 
 
@@ -106,22 +123,17 @@ def _find_headers(data: bytes) -> Iterator[tuple[int, Header]]:
         at = data.find(MARK, at + 1)
 
 
-def _is_cut_header(data: bytes) -> bool:
-    """Return whether a file ends within a header that is intact so far."""
-    return len(data) < _HEADER_SIZE and data.startswith(MARK[: len(data)])
-
-
 def _unpack_unmarked(data: bytes) -> DriveParts:
     """Return the parts of a file without marks, up to where it is damaged."""
     found, at = list[AnyRecording](), 0
     while at + _UNMARKED <= len(data):
         size = int.from_bytes(data[at : at + _UNMARKED], "little")
         body = data[at + _UNMARKED : at + _UNMARKED + size]
-        if len(body) < size and found:
-            break  # cut off by a crash
+        if len(body) < size:  # of a damaged length, or cut off by a crash
+            break
         try:
             found.append(unpack_recording(body))
         except DamagedError:
-            return DriveParts(tuple(found), (UNKNOWN,))
+            break
         at += _UNMARKED + size
-    return DriveParts(tuple(found), (UNKNOWN,) if data and not found else ())
+    return DriveParts(tuple(found), (UNKNOWN,) if at < len(data) else ())

@@ -25,7 +25,7 @@ from evermap.errors import ConfigError, DataError, EvermapError, InputError, Num
 from evermap.io import write_native
 from evermap.io.files import write_atomic
 from evermap.live.inbox import joined
-from evermap.live.parts import pack_part, unpack_parts
+from evermap.live.parts import close_parts, pack_part, unpack_parts
 from evermap.maps.store import StaleRevisionError, open_store
 from evermap.runs.sessions import Entered, TwiceError, enter_session
 from evermap.types import AnyRecording
@@ -132,7 +132,11 @@ class Spool:
         self._file = Path(path).open("ab")  # noqa: SIM115  (until `finish`)
 
     def _let_wait(self, part: Path) -> None:
-        """Take a file for a session that has ended."""
+        """Take a file for a session that has ended, by itself or by a crash."""
+        with part.open("r+b") as file:
+            file.write(close_parts(file.read()))
+            file.flush()
+            os.fsync(file.fileno())
         path = part.with_suffix(WAITING)
         if path.exists():
             path = self.folder / f"{1 + max(_find_numbers(self.folder)):06d}{WAITING}"
