@@ -70,7 +70,7 @@ def test_maps_are_exported_in_formats_of_others(place: Path) -> None:
     write_template(place / "flight", in_space=True)
     assert run("map", "enter", place / "site.evermap", place / "flight", "--out", place / "flown").exit_code == 0
     for kind in MAP_FORMATS:
-        out = place / f"map{kind.ending}"
+        out = place / f"{kind.name}{kind.ending}"
         done = run("map", "export", place / "site.evermap", "--out", out, "--format", kind.name)
         if kind.name == "wpilib-csv":  # in which the tags of a camera's own frame cannot be told
             assert done.exit_code == 2

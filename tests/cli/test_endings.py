@@ -14,7 +14,7 @@ from evermap.errors import InputError
 
 VERBS = [
     "demo", "simulate", "init", "check", "info", "slam", "localize", "together", "audit", "live", "play", "persist",
-    "track", "view", "convert", "work", "learn", "bench",
+    "track", "view", "convert", "score", "work", "learn", "bench",
 ]  # fmt: skip
 GROUPS = {
     "map": [

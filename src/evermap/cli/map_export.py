@@ -169,6 +169,7 @@ def _write_files(
 ) -> None:
     """Write landmarks by their writer, and lifetimes; and say so."""
     from evermap.existence.models import is_model_file, save_lifetimes
+    from evermap.io.files import is_marked
     from evermap.io.landmarks import up_dict
     from evermap.maps.learning import lifetimes_by_class
     from evermap.maps.store import open_store
@@ -178,7 +179,7 @@ def _write_files(
     if out is not None:
         check_output_file(out, inputs=read, force=force)
         if out.suffix == ".yaml" and write is not None:
-            check_output_file(out.with_suffix(".pgm"), inputs=read, force=force)
+            check_output_file(out.with_suffix(".pgm"), inputs=read, force=force, ours=lambda _: is_marked(out))
     if lifetimes is not None:
         check_output_file(lifetimes, inputs=read, ending=".json", force=force, ours=is_model_file)
     with open_store(file) as store:

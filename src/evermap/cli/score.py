@@ -17,7 +17,9 @@ PASSED_ON: dict[str, Any] = {"ignore_unknown_options": True, "help_option_names"
 def score(
     arguments: Annotated[list[str] | None, argument("As of evermap-score.", metavar="TRUTH ESTIMATE...")] = None,
 ) -> None:
-    """Score what a map says has changed against the truth; all arguments are those of evermap-score.
+    """Score maps that change against the truth.
+
+    All arguments are those of evermap-score.
 
     \b
     Examples:

@@ -164,7 +164,7 @@ def _write_image(
     """The image, dark where the value (H, W) is 1, and its YAML."""
     shade = np.rint(255.0 * (1.0 - value[::-1])).astype(np.uint8)  # the first row is the northernmost
     image, (west_m, south_m), (free, occupied) = path.with_suffix(".pgm"), origin_m, thresholds
-    write_atomic(image, f"P5\n# {MARK}\n{value.shape[1]} {value.shape[0]}\n255\n".encode() + shade.tobytes())
+    write_atomic(image, f"P5\n{value.shape[1]} {value.shape[0]}\n255\n".encode() + shade.tobytes())
     return write_atomic(
         path,
         f"{head}# {MARK}\nimage: {image.name}\nmode: scale\nresolution: {cell_m!r}\n"

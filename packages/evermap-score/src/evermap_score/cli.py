@@ -13,7 +13,11 @@ EXIT_USER = 2
 EPILOG = """\
 A table of episodes is CSV or Parquet; see the README. Also read: a folder of a run of evermap, its map, Khronos'
 object_changes.csv, two surveys of any format as BEFORE,AFTER (field layouts of WPILib, tagslam.yaml, id,x,y,z), label
-files of KITTI tracking, 3RScan.json. A trajectory is read from NAME.tum beside NAME.csv."""
+files of KITTI tracking, 3RScan.json. A trajectory is read from NAME.tum beside NAME.csv.
+
+Examples:
+  {program} truth.csv out/monday
+  {program} truth.csv ours.csv theirs.csv --looks looks.csv --markdown"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -22,7 +26,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _make_parser(program: str) -> argparse.ArgumentParser:
-    parser = _Parser(prog=program, description="Score maps that change.", epilog=EPILOG)
+    form = argparse.RawDescriptionHelpFormatter
+    epilog = EPILOG.format(program=program)
+    parser = _Parser(prog=program, description="Score maps that change.", epilog=epilog, formatter_class=form)
     parser.add_argument("truth", metavar="TRUTH", help="episodes that are true")
     parser.add_argument("estimates", metavar="ESTIMATE", nargs="+", help="episodes to score; others minus the first")
     parser.add_argument("--looks", metavar="FILE", help="table stamp_s, landmark_id[, session_id] of opportunities")
