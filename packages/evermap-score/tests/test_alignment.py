@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evermap_score import Episodes, ScoreError, episodes_from_rows, score, write_episodes
-from evermap_score.matching import align, aligned, choose_instants
+from evermap_score.matching import align, apply_alignment, choose_instants
 from evermap_score.trajectory import read_tum
 
 from .worlds import looks_at, table, world_of
@@ -20,46 +20,46 @@ TRUTH = table(
 )  # fmt: skip
 
 
-def turned(episodes: Episodes, angle: float = 0.4, shift: tuple[float, float] = (2.0, -1.0)) -> Episodes:
+def turn(episodes: Episodes, angle: float = 0.4, shift: tuple[float, float] = (2.0, -1.0)) -> Episodes:
     cos, sin = math.cos(angle), math.sin(angle)
-    return episodes.moved_by(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]]), np.array([*shift, 0.0]))
+    return episodes.move(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]]), np.array([*shift, 0.0]))
 
 
 def test_another_frame_is_found_by_static_landmarks_alone() -> None:
-    estimate = turned(TRUTH)
+    estimate = turn(TRUTH)
     # m moved elsewhere, v is somewhere else: neither is static, so neither bends the alignment
     estimate.position_m[4, :2] += 0.7
     estimate.position_m[5, :2] += 3.0
     alignment = align(world_of(TRUTH, estimate), estimate)
     assert alignment.n_static == 3
     assert alignment.rms_m == pytest.approx(0.0, abs=1e-12)
-    assert aligned(estimate, alignment).position_m[:4, :2] == pytest.approx(TRUTH.position_m[:4, :2])
+    assert apply_alignment(estimate, alignment).position_m[:4, :2] == pytest.approx(TRUTH.position_m[:4, :2])
 
 
 def test_a_static_landmark_at_a_wrong_place_does_not_bend_the_frame() -> None:
     truth = table(*((str(n), None, None, 3.0 * (n % 4), 2.5 * (n // 4)) for n in range(12)))
-    estimate = turned(truth)
+    estimate = turn(truth)
     estimate.position_m[0, :2] += 2.0
     alignment = align(world_of(truth, estimate), estimate)
-    off_m = np.linalg.norm((aligned(estimate, alignment).position_m - truth.position_m)[1:, :2], axis=1)
+    off_m = np.linalg.norm((apply_alignment(estimate, alignment).position_m - truth.position_m)[1:, :2], axis=1)
     # Huber's influence of one of twelve is that of .1 m, here .1 m / 12 in the mean; least squares would be .2 m off
     assert off_m.max() < 0.03
     assert alignment.rms_m == pytest.approx(2.0 * math.sqrt(2.0 / 12), rel=0.02)
 
 
 def test_a_covariance_turns_with_the_frame() -> None:
-    estimate = turned(table(("a", None, None, 0, 0), cov_xx_m2=0.04, cov_xy_m2=0.0, cov_yy_m2=0.01), math.pi / 2)
+    estimate = turn(table(("a", None, None, 0, 0), cov_xx_m2=0.04, cov_xy_m2=0.0, cov_yy_m2=0.01), math.pi / 2)
     assert estimate.covariance_m2[0, :2, :2] == pytest.approx(np.diag([0.01, 0.04]))
 
 
 @pytest.mark.parametrize("keep", [["a"], ["m", "v"]])
 def test_too_few_static_landmarks_are_no_alignment(keep: list[str]) -> None:
-    estimate = turned(TRUTH[np.isin(TRUTH.landmark_id, keep)])
+    estimate = turn(TRUTH[np.isin(TRUTH.landmark_id, keep)])
     assert align(world_of(TRUTH, estimate), estimate).n_static == 0
 
 
 def test_without_identities_frames_are_the_same() -> None:
-    estimate = turned(table(("x", None, None, 0, 0), ("y", None, None, 6, 0), ("z", None, None, 0, 4)))
+    estimate = turn(table(("x", None, None, 0, 0), ("y", None, None, 6, 0), ("z", None, None, 0, 4)))
     assert align(world_of(TRUTH, estimate), estimate).n_static == 0
 
 
@@ -87,7 +87,7 @@ def write_tum(path: Path, points: list[tuple[float, float, float]]) -> None:
 
 def test_error_of_a_trajectory_after_the_alignment_of_the_map(tmp_path: Path) -> None:
     write_episodes(TRUTH, tmp_path / "truth.csv")
-    write_episodes(turned(TRUTH), tmp_path / "ours.csv")
+    write_episodes(turn(TRUTH), tmp_path / "ours.csv")
     write_tum(tmp_path / "truth.tum", [(t, t, 0.0) for t in range(5)])
     # .3 m beside the path, in the other frame, at half the stamps only, and not at the last one
     cos, sin = math.cos(0.4), math.sin(0.4)

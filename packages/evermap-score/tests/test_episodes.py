@@ -55,8 +55,8 @@ def test_at_one_instant_a_landmark_is_at_its_most_probable_place() -> None:
 def test_maps_by_robot_time() -> None:
     table = episodes_from_rows([PLAIN | {"robot_time_s": 10}, PLAIN | {"robot_time_s": 20, "x_m": 5}])
     assert table.robot_times_s().tolist() == [10.0, 20.0]
-    assert len(table.known_at(9.0)) == 0
-    assert table.known_at(19.0).position_m[:, 0].tolist() == [1000.0]
+    assert len(table.select_map(9.0)) == 0
+    assert table.select_map(19.0).position_m[:, 0].tolist() == [1000.0]
     assert table.latest().position_m[:, 0].tolist() == [5.0]
 
 

@@ -82,8 +82,8 @@ def test_runs_that_follow_each_other_are_maps_by_robot_time(tmp_path: Path) -> N
     write_run(tmp_path / "c", [landmark(2, 7, 0, 0.95)], third, 310.0)
     table = read_any(tmp_path)
     assert table.robot_times_s().tolist() == [90.0, 210.0, 310.0]
-    assert [row[1:3] for row in spans(table.known_at(90.0))] == [(None, None)] * 3
-    assert spans(table.known_at(210.0)) == sorted(AFTER_TUESDAY, key=repr)
+    assert [row[1:3] for row in spans(table.select_map(90.0))] == [(None, None)] * 3
+    assert spans(table.select_map(210.0)) == sorted(AFTER_TUESDAY, key=repr)
     # the place before has the covariance of the map before
     gone = table.latest()
     gone = gone[(gone.landmark_id == "2") & (gone.t_to_s == 255.0)]

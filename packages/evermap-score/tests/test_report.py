@@ -12,6 +12,7 @@ import pytest
 
 from evermap_score import ScoreError, score, to_json, to_latex, to_markdown, to_text, write_episodes
 from evermap_score.cli import main
+from evermap_score.figures import write_figures
 
 from .worlds import table
 
@@ -69,6 +70,17 @@ def test_the_command_prints_and_writes_figures(tmp_path: Path, capsys: pytest.Ca
     for name in ("reliability", "scores"):
         assert (tmp_path / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
         assert (tmp_path / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["reliability.pdf", "scores.png"])
+def test_a_file_of_another_is_not_replaced_by_a_figure(tmp_path: Path, name: str) -> None:
+    report = score(TRUTH, ESTIMATE, draws=0)
+    for _ in range(2):  # its own are
+        write_figures(report, tmp_path)
+    (tmp_path / name).write_bytes(b"mine")
+    with pytest.raises(ScoreError, match="is there already"):
+        write_figures(report, tmp_path)
+    assert (tmp_path / name).read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize(

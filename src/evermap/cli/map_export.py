@@ -135,12 +135,16 @@ def nav2(
     lifetimes: Annotated[Path | None, option("Lifetimes by class.", hidden=True)] = None,
 ) -> None:
     """Write a file of Nav2."""
+    from evermap.io.files import is_marked
+    from evermap.runs.folder import check_output_file
     from evermap.survival.durations import parse_duration_s
 
     ahead_s = parse_duration_s(ahead) if speed_mask else None
     if p_least is None:
         p_least = 0.0 if speed_mask or route_graph is not None else 0.5
     write = _nav2_writer(out, cell_m, radius_m, ahead_s, route_graph)
+    if route_graph is None:  # a grid has an image beside its YAML
+        check_output_file(out.with_suffix(".pgm"), inputs=[file], ours=lambda _: is_marked(out))
     _write_files(
         file,
         out,
@@ -165,11 +169,10 @@ def _write_files(
     up: str | None,
     as_json: bool,
     inputs: Sequence[Path | None] = (),
-    force: bool = False,
+    force: bool | None = None,
 ) -> None:
     """Write landmarks by their writer, and lifetimes; and say so."""
     from evermap.existence.models import is_model_file, save_lifetimes
-    from evermap.io.files import is_marked
     from evermap.io.landmarks import up_dict
     from evermap.maps.learning import lifetimes_by_class
     from evermap.maps.store import open_store
@@ -178,8 +181,6 @@ def _write_files(
     read = [file, *inputs]
     if out is not None:
         check_output_file(out, inputs=read, force=force)
-        if out.suffix == ".yaml" and write is not None:
-            check_output_file(out.with_suffix(".pgm"), inputs=read, force=force, ours=lambda _: is_marked(out))
     if lifetimes is not None:
         check_output_file(lifetimes, inputs=read, ending=".json", force=force, ours=is_model_file)
     with open_store(file) as store:

@@ -73,14 +73,10 @@ def pack_part(number: int, recording: AnyRecording) -> bytes:
 
 def close_parts(data: bytes) -> bytes:
     """Return what closes a file, behind parts that a crash may have ended: one that it cut off never was there."""
-    count, end = 0, 0
-    for at, header in _find_headers(data):
-        end = at + _HEADER_SIZE + header.size
-        if not header.size:
-            return b""
-        if end <= len(data):
-            count = max(count, header.number)
-    return _pack_header(count, b"") if count else b""
+    headers = list(_find_headers(data))
+    whole = [header.number for at, header in headers if at + _HEADER_SIZE + header.size <= len(data)]
+    is_closed = any(not header.size for _, header in headers)
+    return b"" if is_closed or not headers else _pack_header(max(whole, default=0), b"")
 
 
 def _pack_header(number: int, body: bytes) -> bytes:

@@ -103,37 +103,39 @@ class Spool:
             _sync(self.folder)
         self._parts += 1
         self._unwritten.append(pack_part(self._parts, recording))
-        begin = self._file.tell()
-        try:
-            self._file.write(b"".join(self._unwritten))
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        except OSError:
-            with suppress(OSError):  # a part of a part is damage; it is skipped where it stays
-                os.truncate(self._file.name, begin)
-            self._reopen()
-            raise
-        self._unwritten = []
+        self._flush(self._file)
 
     def finish(self) -> None:
-        """End the present session: it waits to be entered."""
+        """End the present session: it waits to be entered.
+
+        Raises:
+            OSError: a part that found no room finds none now.
+        """
         if self._file is not None:
+            self._flush(self._file)
             path = Path(self._file.name)
             self._file.close()
             self._let_wait(path)
             self._file = None
 
-    def _reopen(self) -> None:
-        """Let go of bytes that the file still holds in memory, and would write once more."""
-        assert self._file is not None
-        path = self._file.name
-        with suppress(OSError):
-            self._file.close()
-        self._file = Path(path).open("ab")  # noqa: SIM115  (until `finish`)
+    def _flush(self, file: IO[bytes]) -> None:
+        begin = file.tell()
+        try:
+            file.write(b"".join(self._unwritten))
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:
+            with suppress(OSError):  # a part of a part is damage; it is skipped where it stays
+                os.truncate(file.name, begin)
+            with suppress(OSError):  # bytes that the file still holds in memory would be written once more
+                file.close()
+            self._file = Path(file.name).open("ab")  # noqa: SIM115  (until `finish`)
+            raise
+        self._unwritten = []
 
     def _let_wait(self, part: Path) -> None:
         """Take a file for a session that has ended, by itself or by a crash."""
-        with part.open("r+b") as file:
+        with suppress(OSError), part.open("r+b") as file:  # what is not closed is damaged, and kept
             file.write(close_parts(file.read()))
             file.flush()
             os.fsync(file.fileno())
@@ -183,17 +185,17 @@ def enter_waiting(map_file: Path, config: Config | None = None) -> Iterator[Brou
 
 
 def _enter_file(map_file: Path, path: Path, config: Config) -> Brought | None:
-    """Enter a session and delete its file, or set it aside; None where nothing was in it."""
-    parts = unpack_parts(path.read_bytes())
-    brought = Brought(path.stem, None)
+    """Enter a session and delete its file, or set it aside; None where there was nothing to enter."""
+    parts, brought = unpack_parts(path.read_bytes()), None
     if sum(len(part.detections) for part in parts.recordings):
         brought = _entered(map_file, joined(parts.recordings), config, path)
     if not parts.lost:
         path.unlink(missing_ok=True)
-        return brought if parts.recordings else None
+        return brought
     aside = path.with_name(f"damaged-{path.name}")
     path.rename(aside)
     _sync(path.parent)
+    brought = brought or Brought(path.stem, None, "nothing of it is left to enter")
     return replace(brought, damage=f"{parts.damage}; the file is kept as {aside}")
 
 

@@ -221,7 +221,7 @@ def check_output_file(
     *,
     inputs: Iterable[str | Path | None] = (),
     ending: str = "",
-    force: bool = False,
+    force: bool | None = None,
     ours: Callable[[Path], bool] = is_marked,
 ) -> None:
     """Check that a single file may be written: it is none of the inputs, and no living map.
@@ -230,7 +230,7 @@ def check_output_file(
         path: the file.
         inputs: files and folders that are read.
         ending: of the files that may be replaced.
-        force: replace an older file of that name, whoever wrote it.
+        force: replace an older file of that name, whoever wrote it; None where a verb has no such option.
         ours: whether evermap wrote such a file, which is replaced without `force`, too.
 
     Raises:
@@ -245,7 +245,8 @@ def check_output_file(
     if _is_living_map(path):
         raise ConfigError("is a living map, which is never replaced", path=path, hint="another name")
     if os.path.lexists(path) and not force and not ours(path):
-        raise ConfigError("is there already, and not by this command", path=path, hint="another name, or --force")
+        hint = "another name" if force is None else "another name, or --force"
+        raise ConfigError("is there already, and not by this command", path=path, hint=hint)
 
 
 def _is_living_map(path: Path) -> bool:

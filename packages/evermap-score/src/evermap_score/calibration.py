@@ -106,7 +106,7 @@ def calibration_items(world: World, estimate: Episodes, *, ahead: bool) -> list[
     return [
         (world.session_of(query_s), name, (p, true))
         for robot_s, query_s in pairs
-        for name, p, true in claims_at(world, estimate.known_at(robot_s), query_s)
+        for name, p, true in claims_at(world, estimate.select_map(robot_s), query_s)
     ]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap_score.episodes import BoolArray, Episodes, FloatArray, IntArray
-from evermap_score.matching import World, assign, distances_m
+from evermap_score.matching import World, agree_classes, assign, distances_m
 from evermap_score.metric import Metric, f1_of, metric_of_rows, ratio, root_of_ratio
 
 KINDS = ("moved", "vanished", "appeared", "returned", "exchanged")
@@ -172,15 +172,10 @@ def _time_of(change: Change, world: World) -> float:
 
 def _may_be(truth: Sequence[Change], claims: Sequence[Change], world: World) -> BoolArray:
     """Say of all pairs (n, m) of changes of one kind whether they may be the same."""
-
-    def compare(field: str) -> BoolArray:
-        one, other = (np.array([getattr(change, field) for change in side]) for side in (truth, claims))
-        return np.asarray(one[:, None] == other[None, :])
-
     if world.rules.match == "identity":
-        return compare("landmark_id")
-    known = np.array([[bool(change.class_id)] for change in truth]) & np.array([bool(each.class_id) for each in claims])
-    allowed = compare("class_id") | ~known
+        one, other = (np.array([change.landmark_id for change in side]) for side in (truth, claims))
+        return np.asarray(one[:, None] == other[None, :])
+    allowed = agree_classes(*(np.array([change.class_id for change in side], np.str_) for side in (truth, claims)))
     for field in ("before_m", "after_m"):
         one, other = (_places([getattr(change, field) for change in side], world) for side in (truth, claims))
         both_absent = np.isnan(one[:, :1]) & np.isnan(other[:, 0])
@@ -194,7 +189,7 @@ def _are_near(one: FloatArray | None, other: FloatArray | None, world: World) ->
     return bool(np.linalg.norm((one - other)[: world.rules.dim]) <= world.rules.match_m)
 
 
-def _squared_sigmas(error_m: FloatArray, covariance_m2: FloatArray) -> float:
+def _square_in_sigmas(error_m: FloatArray, covariance_m2: FloatArray) -> float:
     """Return the squared Mahalanobis distance (d,), (d, d); NaN if the covariance is unknown or singular."""
     if not np.isfinite(covariance_m2).all():
         return float("nan")
@@ -214,7 +209,7 @@ def _is_within_sigmas(true: Change, claim: Change, dim: int) -> bool:
             continue
         if place_m is None or covariance_m2 is None:
             return False
-        if not _squared_sigmas((place_m - truth_m)[:dim], covariance_m2[:dim, :dim]) <= SIGMAS**2:
+        if not _square_in_sigmas((place_m - truth_m)[:dim], covariance_m2[:dim, :dim]) <= SIGMAS**2:
             return False
     return True
 
@@ -308,7 +303,7 @@ def _displacement_metrics(pairs: Sequence[tuple[Change, Change]], dim: int) -> l
         assert claim.before_covariance_m2 is not None
         assert claim.after_covariance_m2 is not None
         covariance = (claim.before_covariance_m2 + claim.after_covariance_m2)[:dim, :dim]
-        if np.isfinite(squared := _squared_sigmas(error_m, covariance)):
+        if np.isfinite(squared := _square_in_sigmas(error_m, covariance)):
             nees.append((true.session, true.landmark_id, (squared / dim, 1.0)))
     return [
         metric_of_rows("displacement/rmse", "m", errors, 2, of_sums=root_of_ratio(0, 1)),
@@ -334,7 +329,7 @@ def _delay_metrics(world: World, estimate: Episodes) -> list[Metric]:
     seconds, looks = [], []
     left = dict(enumerate(derive_changes(world.truth, world)))
     for robot_time_s in estimate.robot_times_s().tolist() if left else []:
-        claims = derive_changes(estimate.known_at(robot_time_s), world, robot_time_s)
+        claims = derive_changes(estimate.select_map(robot_time_s), world, robot_time_s)
         known = [i for i, change in left.items() if change.stamp_s <= robot_time_s]
         for row in match_changes([left[i] for i in known], claims, world)[0].tolist():
             change = left.pop(known[row])

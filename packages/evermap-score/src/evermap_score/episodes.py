@@ -99,7 +99,7 @@ class Episodes:
         """Return the robot times of its maps, sorted; none if there is one map only."""
         return np.unique(self.robot_time_s[np.isfinite(self.robot_time_s)])
 
-    def known_at(self, stamp_s: float) -> Episodes:
+    def select_map(self, stamp_s: float) -> Episodes:
         """Return the last map that is not younger than a robot time; all rows if there is one map only."""
         times = self.robot_times_s()
         if len(times) == 0:
@@ -109,9 +109,9 @@ class Episodes:
 
     def latest(self) -> Episodes:
         """Return the last of its maps."""
-        return self.known_at(np.inf)
+        return self.select_map(np.inf)
 
-    def moved_by(self, rotation: FloatArray, translation_m: FloatArray) -> Episodes:
+    def move(self, rotation: FloatArray, translation_m: FloatArray) -> Episodes:
         """Return the places after a rigid motion, `rotation` (3, 3) first, then `translation_m` (3,)."""
         in_plane = np.isnan(self.position_m[:, 2])
         position_m = np.nan_to_num(self.position_m) @ rotation.T + translation_m

@@ -9,14 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from evermap_score.calibration import bin_by_mass
+from evermap_score.errors import ScoreError
 from evermap_score.score import Report
 
+MARK = "written by evermap-score"
+"""What figures say that a later run may replace."""
 SHOWN = re.compile(r"changes/(\w+)/(any|1)_looks/f1|presence/f1|identity/(idf1|hota)")
 """Names of the metrics of the figure: shares, of which more is better."""
 
 
 def write_figures(report: Report, folder: str | Path) -> list[Path]:
-    """Write `reliability.pdf`, `scores.pdf` and the same as PNG into a folder; return their paths."""
+    """Write `reliability.pdf`, `scores.pdf` and the same as PNG into a folder; return their paths.
+
+    Raises:
+        ScoreError: a file of that name is there that this did not write.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -54,6 +61,8 @@ def write_figures(report: Report, folder: str | Path) -> list[Path]:
     for name, figure in (("reliability", reliability), ("scores", scores)):
         for ending in ("pdf", "png"):
             path = folder / f"{name}.{ending}"
-            figure.savefig(path, dpi=200)
+            if path.exists() and MARK.encode() not in path.read_bytes():
+                raise ScoreError("is there already, and not by this command", path=path, hint="another folder")
+            figure.savefig(path, dpi=200, metadata={"Creator" if ending == "pdf" else "Software": MARK})
             paths.append(path)
     return paths

@@ -61,7 +61,7 @@ def gospa_metrics(world: World, estimate: Episodes) -> list[Metric]:
     items: list[tuple[int, str, tuple[float, float, float, float]]] = []
     for k, stamp_s in enumerate(world.instants_s.tolist()):
         truth = world.truth.state_at(stamp_s)
-        stated = estimate.known_at(stamp_s).state_at(stamp_s, world.rules.present_p)
+        stated = estimate.select_map(stamp_s).state_at(stamp_s, world.rules.present_p)
         at, of = truth.position_m[:, :dim], stated.position_m[:, :dim]
         rows, columns = pair_points(at, of, c_m)
         items.append((k, "", (0.0, 0.0, 0.0, 1.0)))

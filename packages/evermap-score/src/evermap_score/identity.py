@@ -45,9 +45,11 @@ def make_frames(world: World, estimate: Episodes) -> tuple[list[IdentityFrame], 
     frames = []
     for stamp_s in world.instants_s.tolist():
         truth = world.truth.state_at(stamp_s)
-        stated = estimate.known_at(stamp_s).state_at(stamp_s, rules.present_p)
+        stated = estimate.select_map(stamp_s).state_at(stamp_s, rules.present_p)
         away = distances_m(truth.position_m[:, : rules.dim], stated.position_m[:, : rules.dim])
-        similarity = np.where(agree_classes(truth, stated), np.maximum(1.0 - away / (2.0 * rules.match_m), 0.0), 0.0)
+        similarity = np.where(
+            agree_classes(truth.class_id, stated.class_id), np.maximum(1.0 - away / (2.0 * rules.match_m), 0.0), 0.0
+        )
         frames.append(
             IdentityFrame(
                 np.searchsorted(names, truth.landmark_id).astype(np.int64),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap_score.episodes import BoolArray, Episodes, FloatArray, IntArray, LookTable
+from evermap_score.episodes import BoolArray, Episodes, FloatArray, IntArray, LookTable, TextArray
 
 MATCHES = ("identity", "place")
 
@@ -143,15 +143,15 @@ def pair_rows(truth: Episodes, estimate: Episodes, rules: Rules) -> tuple[IntArr
     Rows of different classes are no pair, if both are known (as in Khronos).
     """
     cost = distances_m(truth.position_m[:, : rules.dim], estimate.position_m[:, : rules.dim])
-    allowed = (cost <= rules.match_m) & agree_classes(truth, estimate)
+    allowed = (cost <= rules.match_m) & agree_classes(truth.class_id, estimate.class_id)
     if rules.match == "identity":
         allowed &= truth.landmark_id[:, None] == estimate.landmark_id[None, :]
     return assign(cost, allowed)
 
 
-def agree_classes(first: Episodes, second: Episodes) -> BoolArray:
-    """Say of all pairs of rows (n, m) whether their classes are equal, or one is unknown."""
-    one, other = first.class_id[:, None], second.class_id[None, :]
+def agree_classes(first: TextArray, second: TextArray) -> BoolArray:
+    """Say of all pairs of classes, of (n,) and (m,), whether they are equal, or one is unknown."""
+    one, other = first[:, None], second[None, :]
     return np.asarray((one == other) | (one == "") | (other == ""))
 
 
@@ -233,8 +233,6 @@ def _static_places(table: Episodes, world: World) -> dict[str, FloatArray]:
     return found
 
 
-def aligned(estimate: Episodes, alignment: Alignment) -> Episodes:
+def apply_alignment(estimate: Episodes, alignment: Alignment) -> Episodes:
     """Return an estimate in the frame of the truth."""
-    return (
-        replace(estimate) if alignment.n_static == 0 else estimate.moved_by(alignment.rotation, alignment.translation_m)
-    )
+    return replace(estimate) if alignment.n_static == 0 else estimate.move(alignment.rotation, alignment.translation_m)

@@ -20,11 +20,12 @@ They associate by surfaces by default; here there are centroids only, their opti
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from evermap_score.episodes import Episodes, FloatArray, IntArray, TextArray
-from evermap_score.matching import Rules, World, distances_m
+from evermap_score.matching import Rules, World, agree_classes, distances_m
 from evermap_score.metric import Metric, metric_of_rows
 
 Cell = tuple[int, str, tuple[float, float, float, float, float]]
@@ -72,9 +73,7 @@ def find_nearest(of: PlacedObjects, to: PlacedObjects, match_m: float) -> IntArr
     """Return for each object the nearest one of the other table, of its class and within `match_m`; else -1."""
     if len(of.rows) == 0 or len(to.rows) == 0:
         return np.full(len(of.rows), -1, np.int64)
-    one, other = of.class_id[:, None], to.class_id[None, :]
-    comparable = (one == other) | (one == "") | (other == "")
-    away = np.where(comparable, distances_m(of.position_m, to.position_m), np.inf)
+    away = np.where(agree_classes(of.class_id, to.class_id), distances_m(of.position_m, to.position_m), np.inf)
     nearest = away.argmin(axis=1)
     return np.where(away[np.arange(len(nearest)), nearest] <= match_m, nearest, -1).astype(np.int64)
 
@@ -92,7 +91,7 @@ def presence_metrics(world: World, estimate: Episodes) -> list[Metric]:
     items: list[Cell] = []
     cell = 0
     for robot_time_s in robot_times or [np.inf]:
-        known = estimate.known_at(robot_time_s)
+        known = estimate.select_map(robot_time_s)
         known = known[known.p >= rules.present_p]
         objects = find_objects(known, rules)
         stated = _are_present(known, objects, instants)
@@ -110,7 +109,11 @@ def presence_metrics(world: World, estimate: Episodes) -> list[Metric]:
 
     def select(name: str, part: int, online_only: bool = False) -> Metric:
         return metric_of_rows(
-            name, "", [item for item in items if item[2][4] or not online_only], 5, of_items=_MEANS[part]
+            name,
+            "",
+            [item for item in items if item[2][4] or not online_only],
+            5,
+            of_items=partial(_mean_over_cells, part=part),
         )
 
     return [
@@ -171,18 +174,3 @@ def _mean_over_cells(columns: FloatArray, weights: FloatArray, part: int) -> flo
     if not defined.any():
         return float("nan")
     return float(np.average(over[defined] / below[defined], weights=share[defined]))
-
-
-def _precision(columns: FloatArray, weights: FloatArray) -> float:
-    return _mean_over_cells(columns, weights, 0)
-
-
-def _recall(columns: FloatArray, weights: FloatArray) -> float:
-    return _mean_over_cells(columns, weights, 1)
-
-
-def _f1(columns: FloatArray, weights: FloatArray) -> float:
-    return _mean_over_cells(columns, weights, 2)
-
-
-_MEANS = (_precision, _recall, _f1)

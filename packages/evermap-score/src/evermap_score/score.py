@@ -24,7 +24,7 @@ from evermap_score.matching import (
     Rules,
     World,
     align,
-    aligned,
+    apply_alignment,
     choose_instants,
     choose_match,
 )
@@ -136,7 +136,7 @@ def score(
     world = make_world(key, tables, seen, match, rules)
     true_path = _trajectory_of(truth)
     alignments = {name: align(world, table) for name, table in tables.items()}
-    in_frame = {name: aligned(table, alignments[name]) for name, table in tables.items()}
+    in_frame = {name: apply_alignment(table, alignments[name]) for name, table in tables.items()}
     metrics = {
         name: measure(world, table, true_path, _trajectory_of(named[name]), alignments[name])
         for name, table in in_frame.items()

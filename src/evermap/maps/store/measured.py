@@ -161,7 +161,7 @@ def unpack_trajectory(data: bytes) -> tuple[FloatArray, FloatArray]:
             stamp_s, pose = archive["stamp_s"].astype(np.float64), archive["pose"].astype(np.float64)
         if pose.shape != (len(stamp_s), 3) or not np.isfinite(pose).all():
             raise ValueError("another shape")
-    except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise DamagedError(f"a trajectory that was kept cannot be read: {error}") from None
     return stamp_s, pose
 
@@ -311,6 +311,6 @@ def read_looks(data: bytes, revision: int, landmark_id: int) -> dict[int, Eviden
         for number in found["sessions"].tolist():
             seen = every[(of_look == number) & np.isin(every.clique_id, mine[mine[:, 0] == number, 2])]
             sessions[number or revision] = seen[np.argsort(seen.stamp_s, kind="stable")]
-    except (ValueError, TypeError, LookupError, OSError, zipfile.BadZipFile, zlib.error, EvermapError) as error:
+    except UNREADABLE as error:
         raise DamagedError(f"the looks of revision {revision} are not valid: {error}") from None
     return sessions

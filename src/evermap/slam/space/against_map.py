@@ -185,8 +185,9 @@ def _settle_places(
         if shared.any():  # else the factor follows from what stands, and settles with it
             found = judge(found, accuracy)
         weight = _weigh_places(found, sigma, problem.prior.weight)
+        let_go = weight < 0.5
         if hold is not None:
-            weight[~hold] = LEAST_WEIGHT
+            weight[~hold], let_go[~hold] = LEAST_WEIGHT, False
         back = bool(np.any((weight >= 0.5) & (problem.prior.weight < 0.5)))
         held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
         ignored = _find_ignored(optimum) & (weight >= 0.5)
@@ -201,10 +202,8 @@ def _settle_places(
         now, was = (cost_in_map(one, spread, begun) for one in (optimum, best[0]))
         # places are judged by each other as they are: a few that are wrong may drive out many that are right; and of
         # places that are let go all is so uncertain that they seem to stand
-        is_held_by_all = not np.any(
-            (found.p_stands >= 0.5) & (weight < 0.5) & ~ignored & (True if hold is None else hold)
-        )
-        if is_held_by_all and now < was + problem.settings.repair.gain_nats:
+        seems_to_stand = let_go & (found.p_stands >= 0.5)
+        if not seems_to_stand.any() and now < was + problem.settings.repair.gain_nats:
             best = optimum, found
         decided = is_held and np.array_equal(found.p_stands < 0.5, before.p_stands < 0.5)
         if not held and (decided or np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED):
